@@ -1,0 +1,6 @@
+"""`python -m openvocab_occ` is `openvocab-occ`."""
+
+from openvocab_occ.cli import main
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Drives read from files of many kinds, and a made-up one."""

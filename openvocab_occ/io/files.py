@@ -1,0 +1,97 @@
+"""Files: friendly errors when missing, outputs that are whole or not there at all."""
+
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from openvocab_occ.errors import AlreadyExistsError, NotFoundError
+
+PathLike = str | os.PathLike[str]
+
+
+def existing(path: PathLike, what: str) -> Path:
+    """Return `path`, or raise NotFoundError naming `what` was looked for and what lies beside it."""
+    found = Path(path).expanduser()
+    if found.exists():
+        return found
+    parent = found.parent
+    if not parent.is_dir():
+        raise NotFoundError(f"{what} not found", expected=str(found), got=f"no folder {parent}", fix="check the path")
+    near = sorted(p.name for p in parent.iterdir())[:8]
+    raise NotFoundError(
+        f"{what} not found",
+        expected=str(found),
+        got=f"only {', '.join(near) or 'nothing'} in {parent}",
+        fix="check the path",
+    )
+
+
+def sha256(path: PathLike) -> str:
+    """Return the hex digest of a file's content."""
+    with Path(path).open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def fsync(path: Path) -> None:
+    """Make a file's content, or a folder's list of names, survive a power cut."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def written_folder(path: PathLike, *, marker: str) -> Iterator[Path]:
+    """Yield a temporary sibling of `path` to write into; on success it takes the place of `path`, else it is removed.
+
+    An existing folder is replaced only if it holds a file called `marker`, so that no other folder is ever lost.
+    """
+    target = Path(path).expanduser()
+    if target.exists() and not (target / marker).is_file():
+        raise AlreadyExistsError(
+            f"{target} exists and is not ours to replace",
+            expected=f"a folder with {marker}, or none",
+            fix="choose another output path",
+        )
+    target.parent.mkdir(parents=True, exist_ok=True)
+    scratch = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+    try:
+        scratch.chmod(0o755)
+        yield scratch
+        for child in scratch.rglob("*"):
+            fsync(child)
+        fsync(scratch)
+        if target.exists():
+            # two renames: a crash between them leaves the old folder beside the name, whole
+            old = Path(tempfile.mkdtemp(prefix=f".{target.name}.old.", dir=target.parent))
+            target.rename(old / target.name)
+            scratch.rename(target)
+            shutil.rmtree(old, ignore_errors=True)
+        else:
+            scratch.rename(target)
+        fsync(target.parent)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+@contextmanager
+def written_file(path: PathLike) -> Iterator[Path]:
+    """Yield a temporary sibling to write; on success it takes the place of `path` in one step, else it is removed."""
+    target = Path(path).expanduser()
+    target.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=target.suffix, dir=target.parent)
+    os.close(handle)
+    scratch = Path(name)
+    try:
+        yield scratch
+        fsync(scratch)
+        scratch.chmod(0o644)
+        scratch.replace(target)
+        fsync(target.parent)
+    finally:
+        scratch.unlink(missing_ok=True)

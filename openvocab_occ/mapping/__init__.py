@@ -1,0 +1,1 @@
+"""Features onto voxels, fused over frames."""

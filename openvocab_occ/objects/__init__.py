@@ -1,0 +1,1 @@
+"""Objects, their tree, and the scene map with its files."""

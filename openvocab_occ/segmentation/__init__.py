@@ -1,0 +1,1 @@
+"""2D models as ONNX files, their cards, and the words they know."""

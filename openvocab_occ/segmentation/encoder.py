@@ -1,0 +1,56 @@
+"""What the rest of the toolkit knows of a 2D model: images become cells, and words become vectors of the same space."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+Contract = Literal["dense", "logits"]
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureMap:
+    """The output of a model for one image, at the model's own resolution, and where its cells lie on the image.
+
+    Pixel (u, v) falls at the cell coordinates (scale_u u + offset_u, scale_v v + offset_v), with cell centres at integers.
+    """
+
+    cells: Float32[np.ndarray, "h w c"]
+    """Unit features of a `dense` model; class probabilities of a `logits` model."""
+    scale: tuple[float, float]
+    """Cells a pixel, along u and v."""
+    offset: tuple[float, float]
+    """Cell coordinate of pixel (0, 0)."""
+
+
+@runtime_checkable
+class TextEncoder(Protocol):
+    """Words to vectors."""
+
+    dim: int
+
+    def encode(self, texts: Sequence[str]) -> Float32[np.ndarray, "n c"]:
+        """Return a unit vector for each text."""
+        ...
+
+
+@runtime_checkable
+class PixelEncoder(Protocol):
+    """Images to cells."""
+
+    name: str
+    contract: Contract
+    dim: int
+    """Channels of a cell: feature length, or number of labels."""
+    labels: tuple[str, ...]
+    """Names of the channels of a `logits` model; empty otherwise."""
+    fingerprint: str
+    """sha256 that changes when the model's output would: of the model file and its card."""
+    text: TextEncoder | None
+    """The text side of a `dense` model."""
+
+    def encode(self, images: Sequence[UInt8[np.ndarray, "h w 3"]]) -> list[FeatureMap]:
+        """Run the model on RGB images."""
+        ...
