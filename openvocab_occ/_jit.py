@@ -10,12 +10,16 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
+from itertools import pairwise
 from typing import Any
 
 import numba
 
 kernel: Callable[..., Any] = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath=False)
-"""Decorator of every kernel. Keep a kernel and all it calls in one file: numba's cache does not see other files."""
+"""Decorator of every kernel, above `@typing.no_type_check` (the shape checks of the tests cannot be compiled).
+
+Keep a kernel and all it calls in one file: numba's cache does not see edits in other files.
+"""
 
 _num_threads: ContextVar[int | None] = ContextVar("openvocab_occ_num_threads", default=None)
 _pool: ThreadPoolExecutor | None = None
@@ -58,7 +62,7 @@ def in_slices(work: Callable[[int, int], Any], count: int, *, grain: int = 1) ->
         _pool = ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="openvocab_occ")
     # a few slices a thread, because slices of a picture differ in cost
     edges = [count * i // (4 * threads) for i in range(4 * threads + 1)]
-    jobs = [(a, b) for a, b in zip(edges, edges[1:], strict=False) if b > a]
+    jobs = [(a, b) for a, b in pairwise(edges) if b > a]
     shared = iter(jobs)  # list iterators hand out each job once, also to several threads
 
     def drain() -> None:

@@ -102,7 +102,9 @@ class Camera:
         if self.lens == "fisheye":
             xy: Any = cv2.fisheye.undistortPoints(flat, self.K, coefficients, criteria=criteria)
         else:
-            xy = cv2.undistortPointsIter(flat, self.K, coefficients, np.eye(3), np.eye(3), criteria)
+            # OpenCV 5 takes the criteria in undistortPoints, OpenCV 4 in a function of its own
+            undistort: Any = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
+            xy = undistort(flat, self.K, coefficients, R=np.eye(3), P=np.eye(3), criteria=criteria)
         xy = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
         rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
         again = self._pixels(rays)

@@ -14,7 +14,7 @@ Contract = Literal["dense", "logits"]
 class FeatureMap:
     """The output of a model for one image, at the model's own resolution, and where its cells lie on the image.
 
-    Pixel (u, v) falls at the cell coordinates (scale_u u + offset_u, scale_v v + offset_v), with cell centres at integers.
+    Pixel (u, v) falls at cell coordinates (scale_u u + offset_u, scale_v v + offset_v); cell centres are at integers.
     """
 
     cells: Float32[np.ndarray, "h w c"]
