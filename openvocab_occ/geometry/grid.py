@@ -24,7 +24,7 @@ class GridSpec:
     """Voxels along x, y, z."""
 
     def __post_init__(self) -> None:
-        origin = as_floats(self.origin, (3,), "grid origin")
+        origin = as_floats(np.asarray(self.origin), (3,), "grid origin")
         sizes = np.asarray(self.voxel_size, dtype=np.float64)
         if sizes.shape not in ((), (3,)) or not np.isfinite(sizes).all() or (sizes <= 0).any():
             raise GridError("voxel size is not usable", expected="one or three lengths above 0 m", got=self.voxel_size)
