@@ -2,7 +2,7 @@
 
 import contextlib
 import threading
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -70,7 +70,7 @@ class Viewer:
             self._closed.set()
             stop(self.server)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Viewer":
         return self
 
     def __exit__(self, *_: object) -> None:

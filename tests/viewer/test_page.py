@@ -80,14 +80,14 @@ def test_a_typed_query_marks_the_right_objects(browser, viewer, street):
         for rank, id in enumerate(ids, start=1):
             cells = page.get_by_role("row", name=f"truck #{id}").get_by_role("cell").all_inner_texts()
             assert cells[:3] == [str(rank), f"truck #{id}", "0.89"]
-        page.wait_for_function("() => window.__viserMutable.nodeRefFromName['/hits/label_2'] != null")
+        page.wait_for_function("() => window.__viserMutable.nodeRefFromName['/hits/edges'] != null")
         page.get_by_role("button", name="2", exact=True).click()
         target = street.objects[ids[1]].center
         until(page, lambda: abs(panel.client.camera.look_at - target).max() < 0.1)
         ask(page, panel, "")
         assert panel.answer is None
         page.get_by_text("2 objects").wait_for(state="detached")
-        page.wait_for_function("() => window.__viserMutable.nodeRefFromName['/hits/label_2'] == null")
+        page.wait_for_function("() => window.__viserMutable.nodeRefFromName['/hits/edges'] == null")
     finally:
         page.close()
 
