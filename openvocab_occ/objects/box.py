@@ -62,7 +62,7 @@ class Box:
 
     def contains(self, points: Float[np.ndarray, "n 3"], tolerance: float = 1e-6) -> Bool[np.ndarray, " n"]:
         """Tell which points lie in the box, or at most `tolerance` metres outside each face."""
-        return (np.abs((points - self.center) @ self.axes) <= self.size / 2 + tolerance).all(axis=1)
+        return np.all(np.abs((points - self.center) @ self.axes) <= self.size / 2 + tolerance, axis=1)
 
 
 def least_rectangle(points: Float64[np.ndarray, "n 2"]) -> tuple[Float64[np.ndarray, " 2"], float, float, float]:
