@@ -68,7 +68,7 @@ class GridSpec:
 
     def contains(self, index: Int[np.ndarray, "*n 3"]) -> np.ndarray:
         """Tell which indices lie in the grid, bool[*n]."""
-        return ((index >= 0) & (index < np.asarray(self.shape))).all(axis=-1)
+        return np.asarray(((index >= 0) & (index < np.asarray(self.shape))).all(axis=-1))
 
     def flat(self, index: Int[np.ndarray, "*n 3"]) -> Int[np.ndarray, "*n"]:
         """Return the flat C-order index of each voxel, -1 outside the grid."""

@@ -21,7 +21,7 @@ def as_pose(value: ArrayLike, name: str = "pose") -> Float[np.ndarray, "4 4"]:
     A (3, 4) matrix, as KITTI writes them, gets its last row.
     """
     try:
-        T = as_floats(value, (None, 4), name)
+        rows = as_floats(value, (None, 4), name)
     except ShapeError:
         raise
     except ValueError as error:
@@ -30,8 +30,7 @@ def as_pose(value: ArrayLike, name: str = "pose") -> Float[np.ndarray, "4 4"]:
             expected="a finite rigid motion",
             fix="drop the frame or interpolate its pose",
         ) from error
-    if T.shape == (3, 4):
-        T = np.vstack([T, [0.0, 0.0, 0.0, 1.0]])
+    T = np.vstack([rows, [0.0, 0.0, 0.0, 1.0]]) if rows.shape == (3, 4) else rows
     if T.shape != (4, 4):
         raise ShapeError(f"{name} has the wrong shape", expected="(4, 4) or (3, 4)", got=T.shape)
     if not np.allclose(T[3], [0, 0, 0, 1], atol=1e-6):

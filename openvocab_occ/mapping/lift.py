@@ -85,7 +85,8 @@ def _bilinear_weights(
     cells = np.concatenate([top * width + left, top * width + right, bottom * width + left, bottom * width + right])
     weights = np.concatenate([(1 - y) * (1 - x), (1 - y) * x, y * (1 - x), y * x])
     W = coo_matrix((weights, (np.tile(row, 4), cells)), shape=(num_rows, height * width)).tocsr()
-    return W.astype(np.float32)  # added up in float64, many pixels to one entry
+    W.data = W.data.astype(np.float32)  # added up in float64, for many pixels go to one entry
+    return W
 
 
 def join(parts: Sequence[Lifted]) -> Lifted:

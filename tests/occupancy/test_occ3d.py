@@ -43,6 +43,13 @@ def test_the_same_grid_gives_the_same_bytes(tmp_path, arrays):
     assert masks.camera.all()
 
 
+def test_labels_of_another_integer_type_are_read(tmp_path, arrays):
+    np.savez(tmp_path / "labels.npz", **{key: array.astype(np.int64) for key, array in arrays.items()})
+    grid = read_occ3d(tmp_path / "labels.npz")
+    assert grid.labels.dtype == np.uint8
+    np.testing.assert_array_equal(grid.labels, arrays["semantics"])
+
+
 @pytest.mark.data
 def test_the_real_file_survives_the_round_trip(data, tmp_path):
     source = data / "occ3d" / "labels.npz"
@@ -74,10 +81,10 @@ def test_a_missing_file_is_named(tmp_path):
         (
             {"semantics": np.full(SHAPE, 18, np.uint8)},
             GridError,
-            r"labels\.npz: .* labels are out of range: .* 18\.\.18",
+            r"are out of range: expected labels 0\.\.17, got 18\.\.18",
         ),
-        ({"semantics": np.full(SHAPE, -1)}, GridError, "occupancy labels are out of range"),
-        ({"semantics": np.zeros(SHAPE)}, GridError, "labels are not class numbers: expected integers, got float64"),
+        ({"semantics": np.full(SHAPE, -1)}, GridError, r"semantics of .*labels\.npz are out of range"),
+        ({"semantics": np.zeros(SHAPE)}, GridError, "are not class numbers: expected integers, got float64"),
         ({"mask_lidar": np.full(SHAPE, 2, np.uint8)}, DataError, "mask_lidar of .* is not a mask: expected 0 and 1"),
         ({"mask_lidar": np.zeros((3, 3), np.uint8)}, ShapeError, "mask_lidar of .* has the wrong shape"),
         ({"mask_lidar": np.full(SHAPE, np.nan)}, DataError, "mask_lidar of .* is not a mask"),
