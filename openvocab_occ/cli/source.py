@@ -20,7 +20,7 @@ class Source:
     scene: str | None = None
     """One scene of a source that holds several."""
     occupancy: str | None = None
-    """Your own grids: a pattern with {token} {index} {scene} {timestamp}, such as pred/{token}.npz, below the source."""
+    """Your own grids: files below the source by {token}, {index}, {scene} or {timestamp}, such as pred/{token}.npz."""
     occupancy_frame: str = "lidar_ego"
     """The frame these grids are in: lidar_ego, cam_front_left_ego or lidar."""
     frames: int | None = None

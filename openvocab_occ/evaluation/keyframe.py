@@ -8,12 +8,13 @@ mirrored camera poses is the control: whatever it also scores is not owed to rig
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float, Float32
 
 from openvocab_occ.datasets.frame import Frame, FrameSequence
 from openvocab_occ.depth.render import render_depth
 from openvocab_occ.errors import ConfigError, DataError
 from openvocab_occ.geometry import invert, transform
+from openvocab_occ.occupancy import OccupancyGrid
 from openvocab_occ.objects.scene_map import SceneMap
 from openvocab_occ.pipeline.build import build_map, grid_of
 from openvocab_occ.query.find import score_voxels
@@ -98,8 +99,7 @@ def held_out_depth(frame: Frame, *, held_out: float = 0.2, seed: int = 0) -> Dep
     assert frame.points is not None
     test = np.random.default_rng(seed).random(len(frame.points)) < held_out
     grid = grid_of(replace(frame, points=frame.points[~test], occupancy=None))
-    points = transform(frame.T_world_ego, frame.points[test])
-    points = points[grid.spec.contains(grid.spec.index(transform(invert(grid.T_world_grid), points)))]
+    points = _inside(transform(frame.T_world_ego, frame.points[test]), grid)
     errors: list[np.ndarray] = []
     asked = 0
     for image, view in zip(render_depth(grid, [v.camera for v in frame.views]), frame.views, strict=True):
@@ -125,7 +125,7 @@ def held_out_depth(frame: Frame, *, held_out: float = 0.2, seed: int = 0) -> Dep
 def word_agreement(frame: Frame, scene: SceneMap, encoder: PixelEncoder, word: str) -> WordAgreement:
     """Count returns in voxels that answer `word`, apart for those the word's pixels cover and those they do not."""
     assert frame.points is not None
-    world = transform(frame.T_world_ego, frame.points)
+    world = _inside(transform(frame.T_world_ego, frame.points), grid_of(frame))
     scores = score_voxels(scene, word)
     keys = np.floor(world / scene.voxels.voxel_size).astype(np.int32)
     position = scene.voxels.index(keys)
@@ -135,7 +135,7 @@ def word_agreement(frame: Frame, scene: SceneMap, encoder: PixelEncoder, word: s
     elsewhere: list[np.ndarray] = []
     for view, features in zip(frame.views, encoder.encode([v.image for v in frame.views]), strict=True):
         pixels, _ = view.camera.project(world)
-        seen = view.camera.inside(pixels) & (position >= 0)
+        seen = view.camera.inside(pixels)
         says = _probability(features, pixels[seen].astype(np.float32), channels) >= 0.5
         under.append(answers[seen][says])
         elsewhere.append(answers[seen][~says])
@@ -146,7 +146,7 @@ def word_agreement(frame: Frame, scene: SceneMap, encoder: PixelEncoder, word: s
 
 
 def mirror_cameras(frame: Frame) -> Frame:
-    """Return the frame with its cameras reflected left to right about the ego's x axis: a wrong but rigid calibration."""
+    """Return the frame with its cameras reflected about the ego's x axis: a calibration that is wrong but rigid."""
     flip_ego, flip_cam = np.diag([1.0, -1.0, 1.0, 1.0]), np.diag([-1.0, 1.0, 1.0, 1.0])
     T_ego_world = invert(frame.T_world_ego)
 
@@ -155,6 +155,11 @@ def mirror_cameras(frame: Frame) -> Frame:
 
     views = tuple(replace(v, camera=v.camera.at(mirrored(v.camera.T_world_cam))) for v in frame.views)
     return replace(frame, views=views)
+
+
+def _inside(points: Float[np.ndarray, "n 3"], grid: OccupancyGrid) -> Float[np.ndarray, "m 3"]:
+    """Keep the points of the world that lie in the grid."""
+    return points[grid.spec.contains(grid.spec.index(transform(invert(grid.T_world_grid), points)))]
 
 
 def _channels(scene: SceneMap, word: str) -> Bool[np.ndarray, " c"]:
