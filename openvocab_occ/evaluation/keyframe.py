@@ -14,8 +14,8 @@ from openvocab_occ.datasets.frame import Frame, FrameSequence
 from openvocab_occ.depth.render import render_depth
 from openvocab_occ.errors import ConfigError, DataError
 from openvocab_occ.geometry import invert, transform
-from openvocab_occ.occupancy import OccupancyGrid
 from openvocab_occ.objects.scene_map import SceneMap
+from openvocab_occ.occupancy import OccupancyGrid
 from openvocab_occ.pipeline.build import build_map, grid_of
 from openvocab_occ.query.find import score_voxels
 from openvocab_occ.segmentation.encoder import FeatureMap, PixelEncoder
