@@ -34,8 +34,8 @@ def main() -> None:
         stages["segmenter"].append(seconds(lambda f=frame: encoder.encode([view.image for view in f.views])))
         stages["depth, segmenter, lift and fuse"].append(seconds(lambda f=frame: builder.integrate(f)))
     view = frames[0].views[0].camera
-    print(f"synthetic street, {len(frames)} frames of {len(frames[0].views)} views, {view.width} x {view.height}; "
-          f"{num_threads()} threads, {platform.processor() or platform.machine()}, {datetime.date.today()}")  # fmt: skip
+    print(f"synthetic street: {len(frames)} frames of {len(frames[0].views)} views of {view.width} x {view.height}, "
+          f"{num_threads()} threads, {platform.machine()}, {datetime.date.today()}")  # fmt: skip
     for stage, times in stages.items():
         print(f"  {stage:<32} {statistics.median(times) * 1e3:8.1f} ms a frame")
     print(f"  {'objects and snapshot':<32} {seconds(builder.snapshot) * 1e3:8.1f} ms")
