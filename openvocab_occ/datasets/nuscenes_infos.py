@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 
-from openvocab_occ.arrays import as_floats
 from openvocab_occ.datasets.frame import Frame, FrameSequence, View
 from openvocab_occ.errors import ConfigError, DataError, NotFoundError, ShapeError
 from openvocab_occ.geometry import Camera, as_pose, invert, transform
@@ -128,8 +127,8 @@ def _view(
     T_ego_lidar: Float[np.ndarray, "4 4"] | None,
 ) -> View:
     image = read_image(_find(str(_value(info, "img_path", where)), channel, file, f"image of {where}"))
-    K = as_floats(_value(info, "cam2img", where), (None, None), f"cam2img of {where}")
-    if K.shape[0] < 3 or K.shape[1] < 3:
+    K = _matrix(info, "cam2img", where)
+    if K.ndim != 2 or min(K.shape) < 3:
         raise ShapeError(f"cam2img of {where} has the wrong shape", expected="3x3, 3x4 or 4x4", got=K.shape)
     height, width = image.shape[:2]
     camera = Camera(K[:3, :3], width, height, _camera_pose(info, T_world_ego, T_ego_lidar, where))
@@ -181,5 +180,12 @@ def _value(entry: Mapping[str, Any], key: str, where: str) -> Any:
     return entry[key]
 
 
+def _matrix(entry: Mapping[str, Any], key: str, where: str) -> Float[np.ndarray, "..."]:
+    try:
+        return np.asarray(_value(entry, key, where), dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ShapeError(f"{key} of {where} is no matrix", expected="rows of numbers", got=error) from error
+
+
 def _pose(entry: Mapping[str, Any], key: str, where: str) -> Float[np.ndarray, "4 4"]:
-    return as_pose(_value(entry, key, where), f"{key} of {where}")
+    return as_pose(_matrix(entry, key, where), f"{key} of {where}")
