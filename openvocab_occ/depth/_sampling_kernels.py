@@ -1,0 +1,68 @@
+"""The samples of LMPOcc Eq. 5-9 along a ray, without taking those that cannot be in another voxel than the last."""
+
+from typing import no_type_check
+
+import numpy as np
+
+from openvocab_occ._jit import kernel
+
+_ROUNDING = 1e-14  # relative to |o| + n: far above what o + t d, or the time of a crossing, is ever off by
+
+
+@kernel
+@no_type_check
+def _clip(o, d, n, slack, t_in, t_out):
+    """Cut [t_in, t_out] down to where samples may round to a point inside [0, n) of one axis."""
+    if d == 0.0:
+        return (t_in, t_out) if -slack <= o <= n + slack else (t_in, -1.0)
+    a, b = (-slack - o) / d, (n + slack - o) / d
+    return max(t_in, min(a, b)), min(t_out, max(a, b))
+
+
+@kernel
+@no_type_check
+def _leaving(o, d, slack):
+    """Return a and b such that no sample up to t = a + b i leaves index i of one axis, by motion or by rounding."""
+    if abs(d) < 1e-300:
+        return np.inf, 0.0
+    return ((1.0 - slack - o) / d if d > 0.0 else (slack - o) / d), 1.0 / d
+
+
+@kernel
+@no_type_check
+def first_samples(origin, directions, occupied, step, count, start, stop, out_t, out_voxel):
+    """Find the smallest i of 1..count whose sample origin + i step direction is in an occupied voxel; else t = NaN.
+
+    Takes a sample, then leaps over those that are surely in the same voxel. NaN directions hit nothing.
+    """
+    nx, ny, nz = occupied.shape
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    slack_x, slack_y, slack_z = _ROUNDING * (abs(ox) + nx), _ROUNDING * (abs(oy) + ny), _ROUNDING * (abs(oz) + nz)
+    per_step = (1.0 - 1e-12) / step  # rounds down, so that a leap never skips the first sample outside
+    for r in range(start, stop):
+        out_t[r], out_voxel[r] = np.nan, -1
+        dx, dy, dz = directions[r, 0], directions[r, 1], directions[r, 2]
+        if np.isnan(dx + dy + dz):
+            continue
+        t_in, t_out = _clip(ox, dx, nx, slack_x, 0.0, count * step)
+        t_in, t_out = _clip(oy, dy, ny, slack_y, t_in, t_out)
+        t_in, t_out = _clip(oz, dz, nz, slack_z, t_in, t_out)
+        if not t_in <= t_out:
+            continue
+        ax, bx = _leaving(ox, dx, slack_x)
+        ay, by = _leaving(oy, dy, slack_y)
+        az, bz = _leaving(oz, dz, slack_z)
+        i = max(int(t_in / step), 1)
+        last = min(int(t_out / step) + 1, count)
+        while i <= last:
+            t = i * step
+            px, py, pz = ox + t * dx, oy + t * dy, oz + t * dz
+            if not (0.0 <= px < nx and 0.0 <= py < ny and 0.0 <= pz < nz):
+                i += 1
+                continue
+            x, y, z = int(px), int(py), int(pz)
+            if occupied[x, y, z]:
+                out_t[r], out_voxel[r] = t, (x * ny + y) * nz + z
+                break
+            leaps = min(ax + bx * x, ay + by * y, az + bz * z, t_out) * per_step
+            i = max(i, int(leaps)) + 1
