@@ -1,1 +1,4 @@
 """From frames to a map."""
+
+from openvocab_occ.pipeline.build import MapBuilder as MapBuilder
+from openvocab_occ.pipeline.build import build_map as build_map
