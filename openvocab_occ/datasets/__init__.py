@@ -1,1 +1,6 @@
 """Drives read from files of many kinds, and a made-up one."""
+
+from openvocab_occ.datasets.frame import Frame as Frame
+from openvocab_occ.datasets.frame import FrameSequence as FrameSequence
+from openvocab_occ.datasets.frame import View as View
+from openvocab_occ.datasets.registry import load_sequence as load_sequence
