@@ -32,7 +32,7 @@ def keys_of(points: Float[np.ndarray, "n 3"], voxel_size: float) -> Int32[np.nda
 
 def packable(keys: Int32[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Tell which keys fit into a packed integer."""
-    return ((keys >= _LOWER) & (keys <= _UPPER)).all(axis=1)
+    return np.all((keys >= _LOWER) & (keys <= _UPPER), axis=1)
 
 
 def pack(keys: Int32[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:

@@ -1,7 +1,7 @@
 """The voxel map: sparse, aligned with the world, without bounds; what all frames said about each voxel, added up."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, UInt8
@@ -189,9 +189,9 @@ class VoxelMap:
             raise ConfigError("maps of different kinds cannot be merged", expected=repr(self), got=repr(other))
         self._add(other._packed, other._records[other._row], other._sums[other._row])
 
-    def copy(self) -> Self:
+    def copy(self) -> "VoxelMap":
         """Return a map of its own that no longer grows with this one."""
-        twin = type(self)(self.voxel_size, self.dim, contract=self.contract)
+        twin = VoxelMap(self.voxel_size, self.dim, contract=self.contract)
         twin.merge(self)
         return twin
 
@@ -209,8 +209,8 @@ class VoxelMap:
         columns: Mapping[str, np.ndarray],
         *,
         contract: Contract,
-    ) -> Self:
-        """Build a map from arrays; keys need not be sorted but must differ."""
+    ) -> "VoxelMap":
+        """Build a map from arrays; keys need not be sorted but must differ, features are normalised again."""
         voxels = cls(voxel_size, features.shape[1], contract=contract)
         check_shape(keys, (len(features), 3), "voxel keys")
         check_finite(features, "voxel features")
@@ -224,7 +224,8 @@ class VoxelMap:
         packed, order = np.unique(pack(keys), return_index=True)
         if len(packed) != len(keys) or not packable(keys).all():
             raise DataError("voxel keys repeat or are too large", got=f"{len(keys)} keys, {len(packed)} different")
-        sums = features * (columns["agreement"] * columns["weight"])[:, None]
+        norm = features.sum(axis=1) if contract == "logits" else np.linalg.norm(features, axis=1)
+        sums = features * (columns["agreement"] * columns["weight"] / np.where(norm > 0, norm, 1))[:, None]
         voxels._add(packed, records[order], sums[order].astype(np.float32))
         return voxels
 

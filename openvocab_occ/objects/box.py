@@ -1,7 +1,6 @@
 """Boxes that stand upright: a rectangle on the ground of least area, and a height."""
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int
@@ -33,7 +32,7 @@ class Box:
             )
 
     @classmethod
-    def around(cls, keys: Int[np.ndarray, "n 3"], voxel_size: float) -> Self:
+    def around(cls, keys: Int[np.ndarray, "n 3"], voxel_size: float) -> "Box":
         """Return the upright box of least volume around whole voxels, given by their keys."""
         if not len(keys):
             raise DataError("a box needs voxels", expected="at least 1", got=0)
@@ -63,7 +62,7 @@ class Box:
 
     def contains(self, points: Float[np.ndarray, "n 3"], tolerance: float = 1e-6) -> Bool[np.ndarray, " n"]:
         """Tell which points lie in the box, or at most `tolerance` metres outside each face."""
-        return (np.abs((points - self.center) @ self.axes) <= self.size / 2 + tolerance).all(axis=1)
+        return np.all(np.abs((points - self.center) @ self.axes) <= self.size / 2 + tolerance, axis=1)
 
 
 def least_rectangle(points: Float64[np.ndarray, "n 2"]) -> tuple[Float64[np.ndarray, " 2"], float, float, float]:

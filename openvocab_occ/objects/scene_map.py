@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -28,7 +28,7 @@ class EncoderInfo:
     """Two encoders with the same fingerprint give the same features."""
 
     @classmethod
-    def of(cls, encoder: PixelEncoder) -> Self:
+    def of(cls, encoder: PixelEncoder) -> "EncoderInfo":
         """Describe an encoder."""
         return cls(
             name=encoder.name,
@@ -47,7 +47,7 @@ class NamedCamera(Camera):
     """Channel, such as CAM_FRONT."""
 
     @classmethod
-    def of(cls, camera: Camera, name: str) -> Self:
+    def of(cls, camera: Camera, name: str) -> "NamedCamera":
         """Give a camera a name."""
         return cls(camera.K, camera.width, camera.height, camera.T_world_cam, camera.distortion, camera.lens, name)
 
@@ -105,14 +105,14 @@ class SceneMap:
         return write_map(self, path)
 
     @classmethod
-    def open(cls, path: PathLike) -> Self:
+    def open(cls, path: PathLike) -> "SceneMap":
         """Read a `.ovmap` folder; every file is checked against the manifest's sha256.
 
         Raises NotFoundError where there is no folder, MapError where it is damaged, from the future, or no map.
         """
         from openvocab_occ.objects.ovmap import read_map
 
-        return read_map(path)  # pyright: ignore[reportReturnType]
+        return read_map(path)
 
     def __repr__(self) -> str:
         made = "synthetic " if self.provenance.synthetic else ""

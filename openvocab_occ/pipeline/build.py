@@ -17,6 +17,7 @@ from openvocab_occ.geometry import invert
 from openvocab_occ.mapping import NO_LABEL, VoxelMap, join, lift, rows_from_depth, rows_from_grid
 from openvocab_occ.objects import EncoderInfo, KeyFrame, NamedCamera, Provenance, SceneMap, group_objects
 from openvocab_occ.occupancy import OCC3D_SPEC, OccupancyGrid
+from openvocab_occ.occupancy.lidar import grid_from_lidar
 from openvocab_occ.segmentation.encoder import FeatureMap, PixelEncoder
 
 GridFrom = Literal["auto", "occupancy", "lidar"]
@@ -41,7 +42,9 @@ def build_map(
     """
     if not len(sequence):
         raise DataError("sequence has no frames", expected="at least 1", got=0, fix="check the path and the slice")
-    provenance = provenance or Provenance(name=str(getattr(sequence, "name", "")))
+    if provenance is None:  # a plain list of frames will do, and has no name
+        made_up = bool(getattr(sequence, "synthetic", False))
+        provenance = Provenance(name=str(getattr(sequence, "name", "")), synthetic=made_up)
     builder = MapBuilder(encoder, voxel_size=voxel_size, max_depth=max_depth, provenance=provenance)
     for done, frame in enumerate(sequence, start=1):
         builder.integrate(frame)
@@ -134,19 +137,7 @@ class MapBuilder:
         return SceneMap(voxels, objects, encoder, tuple(self._frames), provenance, self._class_names)
 
     def _grid(self, frame: Frame) -> OccupancyGrid:
-        if frame.occupancy is not None and self._grid_from != "lidar":
-            grid = frame.occupancy
-        elif frame.points is not None and self._grid_from != "occupancy":
-            grid = grid_from_frame(frame)
-        else:
-            have = [n for n, v in (("occupancy", frame.occupancy), ("LiDAR points", frame.points)) if v is not None]
-            raise DataError(
-                f"frame {frame.index} does not say where things are",
-                expected={"auto": "occupancy, LiDAR points", "lidar": "LiDAR points"}.get(self._grid_from, "occupancy")
-                + " or measured depth in every view",
-                got=", ".join(have) or "none of them",
-                fix="pass load_sequence(..., occupancy=PATTERN), or views with depth",
-            )
+        grid = grid_of(frame, self._grid_from)
         if self._class_names and grid.class_names != self._class_names:
             raise DataError(
                 f"grid of frame {frame.index} has other classes than those before",
@@ -185,15 +176,24 @@ class MapBuilder:
             check_shape(features.cells, (None, None, self._encoder.dim), f"output of encoder {self._encoder.name}")
 
 
-def grid_from_frame(frame: Frame) -> OccupancyGrid:
-    """Return a grid of Occ3D's size around the ego, made from the frame's LiDAR points."""
-    from openvocab_occ.occupancy.lidar import grid_from_lidar
-
-    if frame.points is None or "lidar" not in frame.poses:
+def grid_of(frame: Frame, grid_from: GridFrom = "auto") -> OccupancyGrid:
+    """Return the frame's grid: its own, or one of Occ3D's size around the ego, carved from its LiDAR points."""
+    if frame.occupancy is not None and grid_from != "lidar":
+        return frame.occupancy
+    if frame.points is None or grid_from == "occupancy":
+        have = {"occupancy": frame.occupancy, "LiDAR points": frame.points}
+        wanted = {"auto": "occupancy, LiDAR points", "lidar": "LiDAR points", "occupancy": "occupancy"}[grid_from]
+        raise DataError(
+            f"frame {frame.index} does not say where things are",
+            expected=f"{wanted} or measured depth in every view",
+            got=", ".join(name for name, value in have.items() if value is not None) or "none of them",
+            fix="pass load_sequence(..., occupancy=PATTERN), or views with depth",
+        )
+    if "lidar" not in frame.poses:
         raise DataError(
             f"frame {frame.index} cannot be carved from its LiDAR points",
-            expected="points, and the LiDAR's pose in poses['lidar']",
-            got="no points" if frame.points is None else f"poses of {', '.join(frame.poses) or 'nothing'}",
+            expected="the LiDAR's pose in poses['lidar']",
+            got=f"poses of {', '.join(frame.poses) or 'nothing'}",
         )
     origin = (invert(frame.T_world_ego) @ frame.poses["lidar"])[:3, 3]
     return grid_from_lidar(frame.points, origin, OCC3D_SPEC, T_world_grid=frame.T_world_ego, min_range=MIN_LIDAR_RANGE)

@@ -1,5 +1,6 @@
 """Words to objects, and to voxels."""
 
+import itertools
 import math
 import time
 from typing import NamedTuple
@@ -11,7 +12,7 @@ from openvocab_occ.errors import ConfigError, EncoderMismatchError, ModelError
 from openvocab_occ.objects.scene_map import SceneMap
 from openvocab_occ.query.answer import Answer as Answer
 from openvocab_occ.query.answer import Hit, ScoreKind, Verdict
-from openvocab_occ.query.words import Match, checked_text, match_names
+from openvocab_occ.query.words import Match, checked_text, match_labels
 from openvocab_occ.segmentation.encoder import PixelEncoder
 
 LOGITS_THRESHOLD = 0.5
@@ -49,7 +50,7 @@ def find(
     text = checked_text(text)
     reading = _read(scene, text, encoder)
     threshold = _threshold(scene, encoder, threshold)
-    known_words = scene.encoder.contract == "dense" or bool(reading.match.labels)
+    known_words = scene.encoder.contract == "dense" or bool(reading.match.channels.any())
     scored = [Hit(item, float(item.embedding @ reading.vector)) for item in scene.objects] if known_words else []
     scored.sort(key=lambda hit: (-hit.score, hit.object.id))
     hits = tuple(hit for hit in scored if hit.score >= threshold)
@@ -62,7 +63,7 @@ def find(
         threshold=threshold,
         best=scored[0].score if scored else None,
         score_kind=kind,
-        matched=tuple(scene.encoder.labels[label] for label in reading.match.labels),
+        matched=tuple(itertools.compress(scene.encoder.labels, reading.match.channels)),
         unknown=reading.match.unknown,
         nearest=reading.match.nearest,
         known=scene.encoder.labels,
@@ -84,10 +85,8 @@ def _read(scene: SceneMap, text: str, encoder: PixelEncoder | None) -> _Reading:
             fix="load the map's encoder, or build the map again with this one",
         )
     if scene.encoder.contract == "logits":
-        match = match_names(text, scene.encoder.labels)
-        vector = np.zeros(scene.encoder.dim, dtype=np.float32)
-        vector[list(match.labels)] = 1.0
-        return _Reading(vector, match)
+        match = match_labels(text, scene.encoder.labels)
+        return _Reading(match.channels.astype(np.float32), match)
     if encoder is None or encoder.text is None:
         raise ConfigError(
             "this map needs its text encoder to understand words",
@@ -103,7 +102,7 @@ def _read(scene: SceneMap, text: str, encoder: PixelEncoder | None) -> _Reading:
             got=vectors.shape,
         )
     vector = vectors[0] / max(float(np.linalg.norm(vectors[0])), 1e-12)
-    return _Reading(vector.astype(np.float32), Match((), (), (), {}))
+    return _Reading(vector.astype(np.float32), Match(np.zeros(0, dtype=bool)))
 
 
 def _threshold(scene: SceneMap, encoder: PixelEncoder | None, asked: float | None) -> float:

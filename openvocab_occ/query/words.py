@@ -1,38 +1,39 @@
-"""Words of a query against the names that a map knows: the same word, or an inflection of it."""
+"""Words of a query against the labels that a map knows: the same word, or an inflection of it."""
 
 import difflib
 import itertools
 import re
 import unicodedata
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
 
 from openvocab_occ.errors import QueryError
 
 MAX_CHARACTERS = 1000
 STOP_WORDS = frozenset({
-    "a", "all", "an", "and", "any", "are", "at", "each", "every", "find", "for", "in", "is", "it", "me", "my", "of", "on",
-    "or", "please", "show", "some", "that", "the", "there", "these", "this", "those", "to", "where", "which",
+    "a", "all", "an", "and", "any", "are", "at", "each", "every", "find", "for", "in", "is", "it", "me", "my", "of",
+    "on", "or", "please", "show", "some", "that", "the", "there", "these", "this", "those", "to", "where", "which",
 })  # fmt: skip
 """Words that say nothing about the kind of thing. Negations are not among them: they are reported as not understood."""
 _WORD = re.compile(r"[^\W_]+")
-_LONGEST_NAME = 5  # words
+_LONGEST_LABEL = 5  # words
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Match:
     """How a query was read."""
 
-    labels: tuple[int, ...]
-    """Positions of the names that were meant, each once, in the order of the query."""
-    words: tuple[str, ...]
-    """Words of the query that named them."""
-    unknown: tuple[str, ...]
-    """Words that name nothing here, without stop words."""
-    nearest: dict[str, tuple[str, ...]]
-    """Names spelt like an unknown word, nearest first; no entry where there is none."""
+    channels: Bool[np.ndarray, " c"]
+    """Which labels were meant."""
+    unknown: tuple[str, ...] = ()
+    """Words that name no label, without stop words."""
+    nearest: dict[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
+    """Labels spelt like an unknown word, nearest first; no entry where there is none."""
 
 
 def checked_text(text: str) -> str:
@@ -50,45 +51,42 @@ def checked_text(text: str) -> str:
     return text
 
 
-def match_names(text: str, names: Sequence[str]) -> Match:
-    """Read a text as names, longest first; case, hyphens and spaces within a name do not matter."""
+def match_labels(text: str, labels: Sequence[str]) -> Match:
+    """Read a text as labels, longest first; case, hyphens and spaces within a label do not matter."""
     words = _words(text)
-    known = _by_form(tuple(names))
-    labels: dict[int, None] = {}
-    used: list[str] = []
+    known = _by_form(tuple(labels))
+    channels = np.zeros(len(labels), dtype=bool)
     unknown: list[str] = []
     at = 0
     while at < len(words):
-        for length in range(min(_LONGEST_NAME, len(words) - at), 0, -1):
-            window = words[at : at + length]
-            found = sorted({label for form in _forms(window) for label in known.get(form, ())})
+        for length in range(min(_LONGEST_LABEL, len(words) - at), 0, -1):
+            found = {label for form in _forms(words[at : at + length]) for label in known.get(form, ())}
             if found:
-                labels |= dict.fromkeys(found)
-                used.append(" ".join(window))
+                channels[list(found)] = True
                 at += length
                 break
         else:
             if words[at] not in STOP_WORDS:
                 unknown.append(words[at])
             at += 1
-    if not labels and not unknown:
-        unknown = list(words) or [text]
+    if not channels.any() and not unknown:
+        unknown = words or [text]
     unknown = list(dict.fromkeys(unknown))
-    near = {word: difflib.get_close_matches(word, [name.lower() for name in names], n=3) for word in unknown}
-    return Match(tuple(labels), tuple(used), tuple(unknown), {word: tuple(n) for word, n in near.items() if n})
+    near = {word: difflib.get_close_matches(word, [label.lower() for label in labels], n=3) for word in unknown}
+    return Match(channels, tuple(unknown), {word: tuple(found) for word, found in near.items() if found})
 
 
 def _words(text: str) -> list[str]:
-    return _WORD.findall(unicodedata.normalize("NFKC", text).casefold().replace("'s ", " "))
+    return _WORD.findall(unicodedata.normalize("NFKC", text).casefold())
 
 
 @lru_cache(maxsize=8)
-def _by_form(names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
-    """Map every form of every name to the positions of the names that have it."""
+def _by_form(labels: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
+    """Map every form of every label to the channels that have it."""
     known: dict[str, tuple[int, ...]] = {}
-    for position, name in enumerate(names):
-        for form in _forms(_words(name)):
-            known[form] = (*known.get(form, ()), position)
+    for channel, label in enumerate(labels):
+        for form in _forms(_words(label)):
+            known[form] = (*known.get(form, ()), channel)
     return known
 
 
