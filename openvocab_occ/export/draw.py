@@ -15,7 +15,7 @@ SKY = (226, 234, 242)
 _SHADE = (0.80, 0.90, 1.0)  # of faces across x, y and z: the ground is lightest
 _LEAST_PIXELS = 150  # a smaller object has no room for its name
 _MOST_NAMES = 20
-_ROOMY = 6  # names on an object cover at most a sixth of it
+_ROOMY = 10  # names on an object cover at most a tenth of it
 
 
 def paint(

@@ -47,7 +47,7 @@ def paint_labels(labels: Int32[np.ndarray, "*n"], names: Sequence[str]) -> UInt8
 
 
 def paint_numbers(values: Float[np.ndarray, " n"], low: float, high: float, scale: str) -> UInt8[np.ndarray, "n 3"]:
-    """Return colours from low to high on the scale `viridis` or `inferno`; values beyond are clamped, NaN is low."""
+    """Return colours from low to high on the scale `viridis` or `plasma`; values beyond are clamped, NaN is low."""
     import cv2
 
     span = max(high - low, 1e-12)

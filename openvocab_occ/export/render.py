@@ -60,7 +60,7 @@ def overview(scene: SceneMap, aspect: float = 16 / 9, fov: float = 1.0) -> tuple
     centers = scene.voxels.centers
     if not len(centers):
         raise MapError("the map has no voxels to look at", fix="map at least one frame with an occupancy grid or depth")
-    low, high = np.percentile(centers, (2, 98), axis=0)
+    low, high = np.percentile(centers, (0.5, 99.5), axis=0)
     target = (low + high) / 2
     back = np.array([0.0, 0.0, _RISE]) - heading(scene)
     back /= np.linalg.norm(back)

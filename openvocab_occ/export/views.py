@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 import openvocab_occ
-from openvocab_occ.errors import ConfigError
+from openvocab_occ.errors import ConfigError, MapError
 from openvocab_occ.export.draw import SKY, draw_view, paint
 from openvocab_occ.export.palette import NOTHING, UNLABELLED, label_colors, paint_labels
 from openvocab_occ.export.render import MapView, overview_camera, render_map
@@ -77,6 +77,8 @@ def export_views(
         raise ConfigError("max_depth does not fit a depth image", expected=f"0 to {_FARTHEST:.0f} m", got=max_depth)
     if width < 16 or height < 16:
         raise ConfigError("picture is too small", expected="at least 16 x 16 pixels", got=f"{width} x {height}")
+    if not len(scene.voxels):
+        raise MapError("the map has no voxels to render", fix="map at least one frame with an occupancy grid or depth")
     camera, name, T_world_ego = _viewpoint(scene, viewpoint, width, height)
     answer = find(scene, query) if isinstance(query, str) else query
     view, semantics = render_map(scene, camera, max_depth), name_voxels(scene)

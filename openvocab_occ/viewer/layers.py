@@ -10,6 +10,7 @@ from jaxtyping import Float, Float32, Int64, UInt8
 from openvocab_occ.errors import ConfigError
 from openvocab_occ.export.palette import grey, paint_labels, paint_numbers
 from openvocab_occ.export.semantics import name_voxels
+from openvocab_occ.mapping.voxel_map import VoxelMap
 from openvocab_occ.objects.box import Box
 from openvocab_occ.objects.scene_map import SceneMap
 from openvocab_occ.objects.tree import SceneObject
@@ -21,6 +22,7 @@ ColorMode = Literal["image", "semantic", "height", "relevance"]
 COLOR_MODES: tuple[str, ...] = get_args(ColorMode)
 TILE_EDGE = 32.0  # metres; points go to the browser as float16, which is within 8 mm at 16 m from a tile's centre
 HIT_COLOR = (255, 64, 0)
+_WALL_SHADE = 0.82
 _PATH_COLOR = (20, 110, 160)
 _EDGES = np.array(
     [(i, (i + 1) % 4) for i in range(4)] + [(4 + i, 4 + (i + 1) % 4) for i in range(4)] + [(i, 4 + i) for i in range(4)]
@@ -62,22 +64,32 @@ def voxel_colors(
 ) -> UInt8[np.ndarray, "n 3"]:
     """Return the colour of each voxel.
 
-    `image` is the colour the cameras saw, `semantic` that of its label, `height` runs from the 1st to the 99th
-    percentile, `relevance` from the least to the greatest of `scores`.
+    `image` is the colour the cameras saw, `semantic` that of its label, a little darker on walls; `height` runs from
+    the 1st to the 99th percentile; `relevance` from the least of `scores`, grey, to the greatest.
     """
     voxels = scene.voxels
     if mode == "image":
         return voxels.colors
     if mode == "semantic":
         semantics = name_voxels(scene)
-        return paint_labels(semantics.labels, semantics.names)
+        return shade_walls(voxels, paint_labels(semantics.labels, semantics.names))
     if mode == "height":
         return paint_numbers(voxels.centers[:, 2], *height_range(scene), "viridis")
     if mode == "relevance":
         if scores is None:
             raise ConfigError("relevance needs a query", expected="a score for each voxel")
-        return paint_numbers(scores.astype(np.float64), *score_range(scores), "inferno")
+        low, high = score_range(scores)
+        weight = np.clip(3 * (scores - low) / max(high - low, 1e-12), 0, 1)[:, None]  # grey below, pure from a third on
+        heat = paint_numbers(scores.astype(np.float64), low, high, "plasma")
+        ground = shade_walls(voxels, grey(voxels.colors))
+        return (weight * heat + (1 - weight) * ground).astype(np.uint8)
     raise ConfigError("colour mode is not known", expected=" or ".join(COLOR_MODES), got=mode)
+
+
+def shade_walls(voxels: VoxelMap, colors: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
+    """Darken voxels that have another above them, so that flat colours still show shapes."""
+    covered = voxels.index(voxels.keys + np.array([0, 0, 1], np.int32)) >= 0
+    return np.where(covered[:, None], (colors * _WALL_SHADE).astype(np.uint8), colors)
 
 
 def height_range(scene: SceneMap) -> tuple[float, float]:
@@ -135,12 +147,12 @@ def draw_path(nodes: "viser.SceneApi", positions: Float[np.ndarray, "n 3"]) -> N
 
 
 def draw_hits(
-    nodes: "viser.SceneApi", objects: Sequence[SceneObject], captions: Sequence[str]
+    nodes: "viser.SceneApi", objects: Sequence[SceneObject], captions: Sequence[str], margin: float
 ) -> "list[viser.SceneNodeHandle]":
-    """Add a box around each object and, where there is one, its caption above; return the nodes."""
+    """Add a box `margin` metres around each object and a caption above the first ones; return the nodes."""
     if not objects:
         return []
-    edges = np.concatenate([box_edges(item.box, margin=0.08) for item in objects])
+    edges = np.concatenate([box_edges(item.box, margin) for item in objects])
     drawn: list[viser.SceneNodeHandle] = [
         nodes.add_line_segments("/hits/edges", edges, HIT_COLOR, thickness=3.0, thickness_units="screen")
     ]

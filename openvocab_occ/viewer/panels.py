@@ -15,7 +15,7 @@ from openvocab_occ.export.semantics import name_voxels
 from openvocab_occ.objects.scene_map import SceneMap
 from openvocab_occ.objects.tree import SceneObject
 from openvocab_occ.query.find import Answer, Hit, find, score_voxels
-from openvocab_occ.segmentation.encoder import PixelEncoder, TextEncoder
+from openvocab_occ.segmentation.encoder import PixelEncoder
 from openvocab_occ.viewer.layers import (
     COLOR_MODES,
     Tile,
@@ -64,8 +64,8 @@ def answer_line(answer: Answer) -> str:
 
 
 def hit_table(scene: SceneMap, hits: list[Hit]) -> str:
-    """Return the first hits as a table of markdown: rank, object, score, size, distance to the driven path."""
-    rows = ["| | object | score | size, m | away |", "|-:|:-|-:|:-|-:|"]
+    """Return the first hits as a table of markdown: rank, object, score, size, distance from the drive."""
+    rows = ["| | object | score | size, m | from ego |", "|-:|:-|-:|-:|-:|"]
     for rank, hit in enumerate(hits[:LISTED], start=1):
         size = " × ".join(f"{edge:.1f}" for edge in hit.object.box.size)
         away = distance_to_path(scene, hit.object)
@@ -108,7 +108,7 @@ class Panel:
         client: "viser.ClientHandle",
         scene: SceneMap,
         tiles: list[Tile],
-        encoder: PixelEncoder | TextEncoder | None,
+        encoder: PixelEncoder | None,
         mode: str,
     ) -> None:
         self.client = client
@@ -177,7 +177,6 @@ class Panel:
         self.status = gui.add_markdown(_WELCOME)
         self.hits = gui.add_markdown("", visible=False)
         self.buttons: Any = None
-        self._buttons_folder = gui.add_folder("Go to", visible=False)
         self.mode = gui.add_dropdown("Colour", COLOR_MODES, initial_value=mode)
         self.mode.on_update(lambda _event: self.recolor(self.mode.value))
         with gui.add_folder("Legend"):
@@ -195,7 +194,8 @@ class Panel:
             for node in self._drawn:
                 node.remove()
             captions = [f"{rank} {hit.object.label} {hit.score:.2f}" for rank, hit in enumerate(hits[:LISTED], start=1)]
-            self._drawn = draw_hits(self.client.scene, [hit.object for hit in hits[:BOXED]], captions)
+            margin = 0.75 * self.scene.voxels.voxel_size  # clear of the squares, which turn to the camera
+            self._drawn = draw_hits(self.client.scene, [hit.object for hit in hits[:BOXED]], captions, margin)
             self._paint(self.mode.value)
 
     def _offer(self, hits: list[Hit]) -> None:
@@ -203,11 +203,9 @@ class Panel:
         if self.buttons is not None:
             self.buttons.remove()
             self.buttons = None
-        self._buttons_folder.visible = bool(hits)
         if hits:
-            with self._buttons_folder:
-                names = tuple(str(rank) for rank in range(1, min(len(hits), LISTED) + 1))
-                self.buttons = self.client.gui.add_button_group("Hit", names)
+            names = tuple(str(rank) for rank in range(1, min(len(hits), LISTED) + 1))
+            self.buttons = self.client.gui.add_button_group("Go to", names, order=self.hits.order + 1e-3)
             self.buttons.on_click(lambda event: self.go_to(hits[int(event.target.value) - 1].object))
 
     def _paint(self, mode: str) -> None:
@@ -215,7 +213,7 @@ class Panel:
             self.legend.content = "Relevance needs a query: type one above."
             return
         colors = voxel_colors(self.scene, mode, self._scores)
-        if mode != "relevance" and self.answer is not None:
+        if mode != "relevance" and self.answer is not None and self.answer.verdict != "unknown words":
             colors = grey_but(colors, [hit.object for hit in self.answer.hits])
         with self.client.atomic():
             self.legend.content = self._legend(mode)
@@ -233,7 +231,7 @@ class Panel:
             return f"Height from {low:.1f} m (violet) to {high:.1f} m (yellow)."
         if mode == "relevance" and self._scores is not None:
             low, high = score_range(self._scores)
-            return f"Score from {low:.2f} (black) to {high:.2f} (pale yellow)."
+            return f"Score from {low:.2f} (grey) to {high:.2f} (yellow)."
         semantics = name_voxels(self.scene)
         counts = np.bincount(semantics.labels[semantics.labels >= 0], minlength=len(semantics.names))
         colors = label_colors(semantics.names)

@@ -1,14 +1,17 @@
 """The viewer: a page on this machine that shows a map and answers words."""
 
+import contextlib
 import threading
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from openvocab_occ.errors import OpenVocabOccError
 from openvocab_occ.export.render import overview
 from openvocab_occ.io.files import PathLike
 from openvocab_occ.objects.scene_map import SceneMap
-from openvocab_occ.segmentation.encoder import PixelEncoder, TextEncoder
+from openvocab_occ.query.find import find
+from openvocab_occ.segmentation.encoder import PixelEncoder
 from openvocab_occ.viewer.guard import guarded_server, stop
 from openvocab_occ.viewer.layers import draw_map, draw_path, tile_voxels, voxel_colors
 from openvocab_occ.viewer.panels import Panel
@@ -23,9 +26,7 @@ _PANEL_WIDTH = 340
 class Viewer:
     """A map being served; close it, or use it as a context."""
 
-    def __init__(
-        self, server: "viser.ViserServer", scene: SceneMap, encoder: PixelEncoder | TextEncoder | None
-    ) -> None:
+    def __init__(self, server: "viser.ViserServer", scene: SceneMap, encoder: PixelEncoder | None) -> None:
         self.server = server
         self.scene = scene
         self.panels: dict[int, Panel] = {}
@@ -39,6 +40,7 @@ class Viewer:
             self.panels[client.client_id] = Panel(client, scene, self._tiles, encoder, self._mode)
 
         server.on_client_connect(enter)
+        threading.Thread(target=_warm_up, args=(scene, encoder), daemon=True).start()
         server.on_client_disconnect(lambda client: self.panels.pop(client.client_id, None))
 
     @property
@@ -68,7 +70,7 @@ class Viewer:
             self._closed.set()
             stop(self.server)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Viewer":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -91,9 +93,15 @@ class Viewer:
             draw_path(server.scene, np.array([frame.T_world_ego[:3, 3] for frame in scene.frames]).reshape(-1, 3))
 
 
+def _warm_up(scene: SceneMap, encoder: PixelEncoder | None) -> None:
+    """Load what the first query needs, seconds of imports, before a person asks it."""
+    with contextlib.suppress(OpenVocabOccError):  # the query itself will say so
+        find(scene, "object", encoder)
+
+
 def view(
     scene: SceneMap | PathLike,
-    encoder: PixelEncoder | TextEncoder | None = None,
+    encoder: PixelEncoder | None = None,
     *,
     host: str = "127.0.0.1",
     port: int = 8080,
