@@ -5,6 +5,7 @@ Depth is along the camera's z axis, never along the ray.
 """
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -94,6 +95,8 @@ class Camera:
             y = (pixels[..., 1] - self.K[1, 2]) / self.K[1, 1]
             x = (pixels[..., 0] - self.K[0, 2] - self.K[0, 1] * y) / self.K[0, 0]
             return np.stack([x, y, np.ones_like(x)], axis=-1)
+        if not pixels.size:  # OpenCV refuses them
+            return np.empty((*pixels.shape[:-1], 3))
         import cv2
 
         flat = np.ascontiguousarray(pixels.reshape(-1, 1, 2), dtype=np.float64)
@@ -113,7 +116,11 @@ class Camera:
         return rays.reshape(*pixels.shape[:-1], 3)
 
     def project(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-        """Return pixels (u, v) and z-depths of points in the world; the pixel is NaN for points not in front."""
+        """Return pixels (u, v) and z-depths of points in the world.
+
+        The pixel is NaN for points not in front, and for those so far off the axis that the distortion would fold them
+        back into the image.
+        """
         local = transform(invert(self.T_world_cam), points)
         depth = local[:, 2].copy()
         pixels = np.full((len(local), 2), np.nan)
@@ -129,7 +136,8 @@ class Camera:
             return np.empty((0, 2))
         import cv2
 
-        finite = np.isfinite(local).all(axis=1)
+        radius = np.hypot(local[:, 0], local[:, 1]) / local[:, 2]
+        finite = (np.arctan(radius) if self.lens == "fisheye" else radius) < self._reach  # false for NaN
         pixels = np.full((len(local), 2), np.nan)
         zero = np.zeros(3)
         points = np.ascontiguousarray(local[finite, None])
@@ -138,6 +146,22 @@ class Camera:
             found, _ = project(points, zero, zero, self.K, np.asarray(self.distortion))[:2]
             pixels[finite] = np.asarray(found).reshape(-1, 2)
         return pixels
+
+    @cached_property
+    def _reach(self) -> float:
+        """Radius hypot(x, y), of a fisheye the angle, at which the radial distortion turns back or has a pole."""
+        k = self.distortion
+        if self.lens == "fisheye":
+            moved = np.polynomial.Polynomial([0, 1, 0, k[0], 0, k[1], 0, k[2], 0, k[3]])
+            roots = moved.deriv().trim().roots()
+        else:
+            k1, k2, _, _, k3, k4, k5, k6 = (*k, *[0.0] * 8)[:8]
+            moved = np.polynomial.Polynomial([0, 1, 0, k1, 0, k2, 0, k3])
+            divisor = np.polynomial.Polynomial([1, 0, k4, 0, k5, 0, k6]).trim()
+            slope = (moved.deriv() * divisor - moved * divisor.deriv()).trim()
+            roots = np.concatenate([slope.roots(), divisor.roots()])
+        turns = roots[np.abs(roots.imag) < 1e-9].real
+        return float(turns[turns > 0].min(initial=np.inf))
 
     def inside(self, pixels: Float[np.ndarray, "*n 2"]) -> np.ndarray:
         """Tell which pixels lie on the image, within half a pixel of a pixel centre, bool[*n]."""

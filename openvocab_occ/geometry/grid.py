@@ -24,7 +24,7 @@ class GridSpec:
     """Voxels along x, y, z."""
 
     def __post_init__(self) -> None:
-        origin = as_floats(self.origin, (3,), "grid origin")
+        origin = as_floats(np.asarray(self.origin), (3,), "grid origin")
         sizes = np.asarray(self.voxel_size, dtype=np.float64)
         if sizes.shape not in ((), (3,)) or not np.isfinite(sizes).all() or (sizes <= 0).any():
             raise GridError("voxel size is not usable", expected="one or three lengths above 0 m", got=self.voxel_size)
@@ -68,7 +68,7 @@ class GridSpec:
 
     def contains(self, index: Int[np.ndarray, "*n 3"]) -> np.ndarray:
         """Tell which indices lie in the grid, bool[*n]."""
-        return ((index >= 0) & (index < np.asarray(self.shape))).all(axis=-1)
+        return np.asarray(((index >= 0) & (index < np.asarray(self.shape))).all(axis=-1))
 
     def flat(self, index: Int[np.ndarray, "*n 3"]) -> Int[np.ndarray, "*n"]:
         """Return the flat C-order index of each voxel, -1 outside the grid."""

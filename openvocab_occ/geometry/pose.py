@@ -1,11 +1,16 @@
 """Rigid motions as 4x4 float64 matrices. `T_a_b` takes points of frame b into frame a; compose by matching letters."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from openvocab_occ.arrays import as_floats
 from openvocab_occ.errors import PoseError, ShapeError
+
+Vector = ArrayLike | Sequence[float | int]
+"""Numbers in a row; numpy's ArrayLike alone is, to a checker at run time, no tuple."""
 
 _RIGID_TOLERANCE = 1e-3  # float32 poses of real data sets are off by 1e-6; a wrong one by far more
 
@@ -16,7 +21,7 @@ def as_pose(value: ArrayLike, name: str = "pose") -> Float[np.ndarray, "4 4"]:
     A (3, 4) matrix, as KITTI writes them, gets its last row.
     """
     try:
-        T = as_floats(value, (None, 4), name)
+        rows = as_floats(value, (None, 4), name)
     except ShapeError:
         raise
     except ValueError as error:
@@ -25,8 +30,7 @@ def as_pose(value: ArrayLike, name: str = "pose") -> Float[np.ndarray, "4 4"]:
             expected="a finite rigid motion",
             fix="drop the frame or interpolate its pose",
         ) from error
-    if T.shape == (3, 4):
-        T = np.vstack([T, [0.0, 0.0, 0.0, 1.0]])
+    T = np.vstack([rows, [0.0, 0.0, 0.0, 1.0]]) if rows.shape == (3, 4) else rows
     if T.shape != (4, 4):
         raise ShapeError(f"{name} has the wrong shape", expected="(4, 4) or (3, 4)", got=T.shape)
     if not np.allclose(T[3], [0, 0, 0, 1], atol=1e-6):
@@ -52,11 +56,11 @@ def as_pose(value: ArrayLike, name: str = "pose") -> Float[np.ndarray, "4 4"]:
     return T
 
 
-def pose(translation: ArrayLike = (0.0, 0.0, 0.0), wxyz: ArrayLike = (1.0, 0.0, 0.0, 0.0)) -> Float[np.ndarray, "4 4"]:
+def pose(translation: Vector = (0.0, 0.0, 0.0), wxyz: Vector = (1.0, 0.0, 0.0, 0.0)) -> Float[np.ndarray, "4 4"]:
     """Build a pose from a translation in metres and a quaternion."""
     T = np.eye(4)
     T[:3, :3] = matrix_from_wxyz(wxyz)
-    T[:3, 3] = as_floats(translation, (3,), "translation")
+    T[:3, 3] = as_floats(np.asarray(translation), (3,), "translation")
     return T
 
 
@@ -75,9 +79,9 @@ def transform(T_a_b: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*n 3"]
     return points.astype(np.float64) @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
-def matrix_from_wxyz(wxyz: ArrayLike) -> Float[np.ndarray, "3 3"]:
+def matrix_from_wxyz(wxyz: Vector) -> Float[np.ndarray, "3 3"]:
     """Return the rotation of a quaternion, which need not be of unit length but not zero."""
-    q = as_floats(wxyz, (4,), "quaternion")
+    q = as_floats(np.asarray(wxyz), (4,), "quaternion")
     norm = float(np.linalg.norm(q))
     if norm < 1e-9:
         raise PoseError("quaternion is zero", expected="w, x, y, z of unit length", got=q.tolist())
@@ -106,14 +110,14 @@ def wxyz_from_matrix(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
     return q if q[0] >= 0 else -q
 
 
-def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Float[np.ndarray, "4 4"]:
+def look_at(position: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> Float[np.ndarray, "4 4"]:
     """Return T_world_cam of a camera at `position` that looks at `target` (x right, y down, z forward)."""
-    eye = as_floats(position, (3,), "position")
-    forward = as_floats(target, (3,), "target") - eye
+    eye = as_floats(np.asarray(position), (3,), "position")
+    forward = as_floats(np.asarray(target), (3,), "target") - eye
     if np.linalg.norm(forward) < 1e-9:
         raise PoseError("a camera cannot look at its own position", got=eye.tolist())
     forward = forward / np.linalg.norm(forward)
-    right = np.cross(forward, as_floats(up, (3,), "up"))
+    right = np.cross(forward, as_floats(np.asarray(up), (3,), "up"))
     if np.linalg.norm(right) < 1e-6:  # straight up or down: any right will do
         right = np.cross(forward, [0.0, 1.0, 0.0] if abs(forward[1]) < 0.9 else [1.0, 0.0, 0.0])
     right = right / np.linalg.norm(right)

@@ -4,7 +4,7 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -46,7 +46,7 @@ def fsync(path: Path) -> None:
 
 
 @contextmanager
-def written_folder(path: PathLike, *, marker: str) -> Iterator[Path]:
+def written_folder(path: PathLike, *, marker: str) -> Generator[Path, None, None]:
     """Yield a temporary sibling of `path` to write into; on success it takes the place of `path`, else it is removed.
 
     An existing folder is replaced only if it holds a file called `marker`, so that no other folder is ever lost.
@@ -80,7 +80,7 @@ def written_folder(path: PathLike, *, marker: str) -> Iterator[Path]:
 
 
 @contextmanager
-def written_file(path: PathLike) -> Iterator[Path]:
+def written_file(path: PathLike) -> Generator[Path, None, None]:
     """Yield a temporary sibling to write; on success it takes the place of `path` in one step, else it is removed."""
     target = Path(path).expanduser()
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -13,7 +13,7 @@ def read_image(path: PathLike) -> UInt8[np.ndarray, "h w 3"]:
     """Read a colour image as RGB."""
     import cv2
 
-    bgr = cv2.imdecode(np.frombuffer(existing(path, "image").read_bytes(), np.uint8), cv2.IMREAD_COLOR)
+    bgr = _decode(existing(path, "image").read_bytes(), cv2.IMREAD_COLOR)
     if bgr is None:
         raise DataError(f"image {path} cannot be decoded", expected="a JPEG or PNG", fix="is the file truncated?")
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)  # pyright: ignore[reportReturnType]
@@ -23,7 +23,7 @@ def read_depth(path: PathLike) -> UInt16[np.ndarray, "h w"]:
     """Read a one-channel 16-bit image."""
     import cv2
 
-    image = cv2.imdecode(np.frombuffer(existing(path, "depth image").read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    image = _decode(existing(path, "depth image").read_bytes(), cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 2 or image.dtype != np.uint16:
         got = "no image" if image is None else f"{image.dtype} {image.shape}"
         raise DataError(f"depth image {path} is not usable", expected="16-bit, one channel", got=got)
@@ -37,8 +37,22 @@ def write_image(
     import cv2
 
     pixels = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
-    done, data = cv2.imencode(Path(path).suffix, pixels)
-    if not done:
-        raise DataError(f"image {path} cannot be encoded", got=f"{image.dtype} {image.shape}")
+    try:
+        done, data = cv2.imencode(Path(path).suffix, pixels)
+    except cv2.error:  # an ending that OpenCV does not know
+        done, data = False, None
+    if not done or data is None:
+        raise DataError(
+            f"image {path} cannot be encoded",
+            got=f"{image.dtype} {image.shape}",
+            fix="name it .png, or .jpg for 8 bits",
+        )
     with written_file(path) as scratch:
         scratch.write_bytes(data.tobytes())
+
+
+def _decode(content: bytes, flags: int) -> np.ndarray | None:
+    """Return the pixels, or None where OpenCV finds no image, or nothing at all."""
+    import cv2
+
+    return cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None

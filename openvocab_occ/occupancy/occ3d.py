@@ -34,11 +34,16 @@ def read_occ3d(path: PathLike, T_world_grid: ArrayLike | None = None) -> Occupan
     """
     file = existing(path, "Occ3D labels")
     semantics, mask_lidar = _read_arrays(file, ("semantics", "mask_lidar"))
+    if not np.issubdtype(semantics.dtype, np.integer):
+        raise GridError(f"semantics of {file} are not class numbers", expected="integers", got=semantics.dtype)
+    low, high = int(semantics.min()), int(semantics.max())
+    if low < 0 or high >= len(OCC3D_CLASSES):
+        raise GridError(
+            f"semantics of {file} are out of range", expected=f"labels 0..{OCC3D_FREE}", got=f"{low}..{high}"
+        )
     T = np.eye(4) if T_world_grid is None else np.asarray(T_world_grid)
-    try:
-        return OccupancyGrid(semantics, OCC3D_SPEC, T, OCC3D_FREE, known=_as_mask(mask_lidar, "mask_lidar", file))
-    except GridError as error:
-        raise GridError(f"{file}: {error.what}", expected=error.expected, got=error.got) from error
+    known = _as_mask(mask_lidar, "mask_lidar", file)
+    return OccupancyGrid(semantics.astype(np.uint8), OCC3D_SPEC, T, OCC3D_FREE, known=known)
 
 
 def read_occ3d_masks(path: PathLike) -> Occ3DMasks:
