@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import overload
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
@@ -60,7 +60,13 @@ class Frame:
         object.__setattr__(self, "T_world_ego", as_pose(self.T_world_ego, f"T_world_ego of frame {self.index}"))
 
 
-class FrameSequence(Sequence[Frame]):
+if TYPE_CHECKING:
+    _Frames = Sequence[Frame]
+else:
+    _Frames = Sequence  # told the items' type, a run-time checker reads a frame to see whether it is one
+
+
+class FrameSequence(_Frames):
     """Frames of one drive, each read when it is asked for; a slice is a sequence again."""
 
     def __init__(self, name: str, indices: Sequence[int], read: Callable[[int], Frame]) -> None:
