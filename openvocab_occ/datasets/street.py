@@ -140,7 +140,8 @@ def load_street(
     if not 1 <= frames <= MAX_FRAMES:
         raise ConfigError("the street is too short", expected=f"1 to {MAX_FRAMES} frames", got=frames)
     place = street(seed)
-    return FrameSequence(f"synthetic-street-{seed}", range(frames), lambda index: _frame(place, index))
+    name = f"synthetic-street-{seed}"
+    return FrameSequence(name, range(frames), lambda index: _frame(place, index), source="city", synthetic=True)
 
 
 def ego_pose(time: float) -> Float[np.ndarray, "4 4"]:

@@ -17,9 +17,9 @@ from openvocab_occ.geometry import invert, transform
 from openvocab_occ.mapping import keys_of
 from openvocab_occ.objects.scene_map import SceneMap
 from openvocab_occ.occupancy import OccupancyGrid
-from openvocab_occ.pipeline.build import build_map, grid_from_frame
+from openvocab_occ.pipeline.build import build_map, grid_of
 from openvocab_occ.query.find import score_voxels
-from openvocab_occ.query.words import match_names
+from openvocab_occ.query.words import match_labels
 from openvocab_occ.segmentation.encoder import FeatureMap, PixelEncoder
 
 
@@ -100,7 +100,7 @@ def held_out_depth(frame: Frame, *, held_out: float = 0.2, seed: int = 0) -> Dep
     """Make a grid of some of the returns and compare its depth, at each other return's pixel, with that return's."""
     assert frame.points is not None
     test = np.random.default_rng(seed).random(len(frame.points)) < held_out
-    grid = grid_from_frame(replace(frame, points=frame.points[~test], occupancy=None))
+    grid = grid_of(replace(frame, points=frame.points[~test], occupancy=None))
     points = _inside(transform(frame.T_world_ego, frame.points[test]), grid)
     errors: list[np.ndarray] = []
     asked = 0
@@ -127,7 +127,7 @@ def held_out_depth(frame: Frame, *, held_out: float = 0.2, seed: int = 0) -> Dep
 def word_agreement(frame: Frame, scene: SceneMap, encoder: PixelEncoder, word: str) -> WordAgreement:
     """Count returns in voxels that answer `word`, apart for those the word's pixels cover and those they do not."""
     assert frame.points is not None
-    world = _inside(transform(frame.T_world_ego, frame.points), grid_from_frame(frame))
+    world = _inside(transform(frame.T_world_ego, frame.points), grid_of(frame))
     scores = score_voxels(scene, word)
     position = scene.voxels.index(keys_of(world, scene.voxels.voxel_size))
     answers = (position >= 0) & (scores[position] >= 0.5)
@@ -165,8 +165,7 @@ def _inside(points: Float[np.ndarray, "n 3"], grid: OccupancyGrid) -> Float[np.n
 
 def _channels(scene: SceneMap, word: str) -> Bool[np.ndarray, " c"]:
     """Tell which labels of a logits map answer the word."""
-    channels = np.zeros(len(scene.encoder.labels), dtype=bool)
-    channels[list(match_names(word, scene.encoder.labels).labels)] = True
+    channels = match_labels(word, scene.encoder.labels).channels
     if not channels.any():
         raise ConfigError("the model has no label for the word", expected=", ".join(scene.encoder.labels), got=word)
     return channels

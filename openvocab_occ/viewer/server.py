@@ -41,7 +41,11 @@ class Viewer:
 
         server.on_client_connect(enter)
         threading.Thread(target=_warm_up, args=(scene, encoder), daemon=True).start()
-        server.on_client_disconnect(lambda client: self.panels.pop(client.client_id, None))
+
+        def leave(client: "viser.ClientHandle") -> None:
+            self.panels.pop(client.client_id, None)
+
+        server.on_client_disconnect(leave)
 
     @property
     def port(self) -> int:
