@@ -24,7 +24,7 @@ GridFrom = Literal["auto", "occupancy", "lidar"]
 """Where a frame's grid comes from: its own occupancy, its LiDAR points, or (auto) the first of the two it has."""
 DEFAULT_VOXEL_SIZE = 0.1  # metres, where no grid gives one
 MAX_DEPTH = 60.0
-MIN_LIDAR_RANGE = 1.5  # metres; nearer returns are of the car that carries the LiDAR
+MIN_LIDAR_RANGE = 2.2  # metres; nearer returns are of the car under the LiDAR (nuScenes: its bonnet, up to 2.05 m)
 
 
 def build_map(

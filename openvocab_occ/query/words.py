@@ -54,46 +54,58 @@ def checked_text(text: str) -> str:
 def match_labels(text: str, labels: Sequence[str]) -> Match:
     """Read a text as labels, longest first; case, hyphens and spaces within a label do not matter."""
     words = _words(text)
-    known = _by_form(tuple(labels))
-    channels = np.zeros(len(labels), dtype=bool)
-    unknown: list[str] = []
-    at = 0
-    while at < len(words):
-        for length in range(min(_LONGEST_LABEL, len(words) - at), 0, -1):
-            found = {label for form in _forms(words[at : at + length]) for label in known.get(form, ())}
-            if found:
-                channels[list(found)] = True
-                at += length
-                break
-        else:
-            if words[at] not in STOP_WORDS:
-                unknown.append(words[at])
-            at += 1
-    if not channels.any() and not unknown:
+    channels, unknown = _read(words, tuple(labels), inflect=False)
+    if unknown or not channels:  # the slow way only where the quick one leaves something
+        channels, unknown = _read(words, tuple(labels), inflect=True)
+    if not channels and not unknown:
         unknown = words or [text]
+    meant = np.zeros(len(labels), dtype=bool)
+    meant[channels] = True
     unknown = list(dict.fromkeys(unknown))
     near = {word: difflib.get_close_matches(word, [label.lower() for label in labels], n=3) for word in unknown}
-    return Match(channels, tuple(unknown), {word: tuple(found) for word, found in near.items() if found})
+    return Match(meant, tuple(unknown), {word: tuple(found) for word, found in near.items() if found})
 
 
 def _words(text: str) -> list[str]:
     return _WORD.findall(unicodedata.normalize("NFKC", text).casefold())
 
 
-@lru_cache(maxsize=8)
-def _by_form(labels: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
+def _read(words: Sequence[str], labels: tuple[str, ...], *, inflect: bool) -> tuple[list[int], list[str]]:
+    """Return the channels that were meant and the words left over, without stop words."""
+    known = _by_form(labels, inflect)
+    channels: list[int] = []
+    unknown: list[str] = []
+    at = 0
+    while at < len(words):
+        for length in range(min(_LONGEST_LABEL, len(words) - at), 0, -1):
+            found = [c for form in _forms(words[at : at + length], inflect) for c in known.get(form, ())]
+            if found:
+                channels += found
+                at += length
+                break
+        else:
+            if words[at] not in STOP_WORDS:
+                unknown.append(words[at])
+            at += 1
+    return channels, unknown
+
+
+@lru_cache(maxsize=16)
+def _by_form(labels: tuple[str, ...], inflect: bool) -> dict[str, tuple[int, ...]]:
     """Map every form of every label to the channels that have it."""
     known: dict[str, tuple[int, ...]] = {}
     for channel, label in enumerate(labels):
-        for form in _forms(_words(label)):
+        for form in _forms(_words(label), inflect):
             known[form] = (*known.get(form, ()), channel)
     return known
 
 
-def _forms(words: Sequence[str]) -> set[str]:
+def _forms(words: Sequence[str], inflect: bool) -> set[str]:
     """Return the words run together, as they are and in the singular; so "dining tables" meets "diningtable"."""
     if not words:
         return set()
+    if not inflect:
+        return {"".join(words)}
     return {"".join(choice) for choice in itertools.product(*[{word, singular(word)} for word in words])}
 
 
@@ -110,6 +122,6 @@ def singular(word: str) -> str:
 
 @lru_cache(maxsize=1)
 def _inflect() -> Any:
-    import inflect  # 1.7 s, so on the first query only
+    import inflect  # takes a second or two
 
     return inflect.engine()
