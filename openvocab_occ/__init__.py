@@ -13,6 +13,8 @@ Names load on first use (PEP 562), so that importing this package loads nothing 
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from openvocab_occ._version import __version__ as __version__
+
 if TYPE_CHECKING:
     from openvocab_occ.datasets.frame import Frame as Frame
     from openvocab_occ.datasets.frame import View as View
@@ -37,8 +39,6 @@ if TYPE_CHECKING:
     from openvocab_occ.segmentation.encoder import TextEncoder as TextEncoder
     from openvocab_occ.segmentation.onnx import load_encoder as load_encoder
     from openvocab_occ.viewer.server import view as view
-
-__version__ = "0.1.0"
 
 _HOME = {
     "Answer": "openvocab_occ.query.find",

@@ -1,11 +1,15 @@
 """Checks at the border: arrays come in from users and files, and are right from here on."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from openvocab_occ.errors import DataError, ShapeError
+
+ArrayLike = NDArray[Any] | Sequence[Any] | float
+"""What a caller may pass for an array. numpy's own alias refuses tuples when it is checked at run time."""
 
 
 def check_shape(array: NDArray[np.generic], shape: Sequence[int | None], name: str) -> None:

@@ -4,6 +4,7 @@ import sys
 from importlib import import_module
 from typing import NamedTuple
 
+from openvocab_occ._version import __version__
 from openvocab_occ.errors import OpenVocabOccError
 
 
@@ -40,7 +41,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(_help())
         return 0
     if words[0] == "--version":
-        print(import_module("openvocab_occ").__version__)
+        print(__version__)
         return 0
     name = next((" ".join(words[:n]) for n in (2, 1) if " ".join(words[:n]) in COMMANDS), None)
     if name is None:

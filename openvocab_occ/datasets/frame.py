@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import overload
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
@@ -60,11 +60,30 @@ class Frame:
         object.__setattr__(self, "T_world_ego", as_pose(self.T_world_ego, f"T_world_ego of frame {self.index}"))
 
 
-class FrameSequence(Sequence[Frame]):
+if TYPE_CHECKING:
+    _Frames = Sequence[Frame]
+else:
+    _Frames = Sequence  # told the items' type, a run-time checker reads a frame to see whether it is one
+
+
+class FrameSequence(_Frames):
     """Frames of one drive, each read when it is asked for; a slice is a sequence again."""
 
-    def __init__(self, name: str, indices: Sequence[int], read: Callable[[int], Frame]) -> None:
+    def __init__(
+        self,
+        name: str,
+        indices: Sequence[int],
+        read: Callable[[int], Frame],
+        *,
+        source: str = "",
+        synthetic: bool = False,
+    ) -> None:
         self.name = name
+        """Of the drive."""
+        self.source = source
+        """Kind of the data set."""
+        self.synthetic = synthetic
+        """True when nobody drove it."""
         self._indices = indices
         self._read = read
 
@@ -77,7 +96,7 @@ class FrameSequence(Sequence[Frame]):
     def __getitem__(self, index: slice) -> "FrameSequence": ...
     def __getitem__(self, index: int | slice) -> "Frame | FrameSequence":
         if isinstance(index, slice):
-            return FrameSequence(self.name, self._indices[index], self._read)
+            return self._like(self._indices[index], self._read)
         return self._read(self._indices[index])
 
     def __iter__(self) -> Iterator[Frame]:
@@ -85,4 +104,7 @@ class FrameSequence(Sequence[Frame]):
 
     def map(self, change: Callable[[Frame], Frame]) -> "FrameSequence":
         """Return the sequence whose frames are `change(frame)`, each made when it is asked for."""
-        return FrameSequence(self.name, self._indices, lambda index: change(self._read(index)))
+        return self._like(self._indices, lambda index: change(self._read(index)))
+
+    def _like(self, indices: Sequence[int], read: Callable[[int], Frame]) -> "FrameSequence":
+        return FrameSequence(self.name, indices, read, source=self.source, synthetic=self.synthetic)

@@ -45,7 +45,10 @@ def load_infos(
     elif len(set(scenes)) == 1:
         scene = scenes[0]
     return FrameSequence(
-        scene or file.stem, range(len(entries)), lambda index: _frame(entries[index], index, file, cameras)
+        scene or file.stem,
+        range(len(entries)),
+        lambda index: _frame(entries[index], index, file, cameras),
+        source="nuscenes-infos",
     )
 
 

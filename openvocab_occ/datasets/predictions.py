@@ -8,8 +8,9 @@ from string import Formatter
 
 import numpy as np
 
+from openvocab_occ.arrays import check_finite, check_shape
 from openvocab_occ.datasets.frame import Frame, FrameSequence
-from openvocab_occ.errors import ConfigError, DataError, OpenVocabOccError, ShapeError, UnsafeFileError
+from openvocab_occ.errors import ConfigError, DataError, GridError, OpenVocabOccError, ShapeError, UnsafeFileError
 from openvocab_occ.geometry import GridSpec
 from openvocab_occ.io.files import PathLike, existing
 from openvocab_occ.occupancy import OCC3D_CLASSES, OCC3D_SPEC, OccupancyGrid
@@ -90,9 +91,10 @@ def read_prediction(
     file = existing(path, f"{what} file")
     try:
         with file.open("rb") as stream:
-            content = np.load(stream, allow_pickle=False)
-            arrays = {key: content[key] for key in content.files} if isinstance(content, np.lib.npyio.NpzFile) else None
-            return _grid(*_choose(file.name, content if arrays is None else arrays), grid, T, file.name)
+            content: Any = np.load(stream, allow_pickle=False)
+            if isinstance(content, np.lib.npyio.NpzFile):
+                content = {key: content[key] for key in content.files}
+            return _grid(*_choose(file.name, content), grid, T, file.name)
     except OpenVocabOccError:
         raise
     except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
@@ -164,18 +166,23 @@ def _grid(array: np.ndarray, known: np.ndarray | None, grid: GridFormat, T: np.n
             got=f"{array.dtype} {array.shape}",
             fix=_advice(array, shape, count),
         )
-    try:
-        if is_logits:
-            return OccupancyGrid.from_logits(
-                array, grid.spec, T, free_label=free, known=_mask(known), class_names=grid.class_names
-            )
-        return OccupancyGrid(array, grid.spec, T, free, None, _mask(known), grid.class_names)
-    except OpenVocabOccError as error:
-        raise type(error)(f"{what}: {error.what}", expected=error.expected, got=error.got, fix=error.fix) from error
-
-
-def _mask(known: np.ndarray | None) -> np.ndarray | None:
-    return None if known is None else known != 0
+    if known is not None:
+        check_shape(known, shape, f"mask_lidar of {what}")
+        known = known != 0
+    if is_logits:
+        check_finite(array, f"logits of {what}")
+        return OccupancyGrid.from_logits(
+            array, grid.spec, T, free_label=free, known=known, class_names=grid.class_names
+        )
+    low, high = int(array.min()), int(array.max())
+    if low < 0 or high >= count:
+        raise GridError(
+            f"{what} has labels out of range",
+            expected=f"0..{count - 1} ({count} classes)",
+            got=f"{low}..{high}",
+            fix="for other classes pass occupancy_classes and occupancy_free",
+        )
+    return OccupancyGrid(array.astype(np.uint8), grid.spec, T, free, None, known, grid.class_names)
 
 
 def _advice(array: np.ndarray, shape: tuple[int, int, int], count: int) -> str:

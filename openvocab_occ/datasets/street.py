@@ -100,7 +100,7 @@ class Street:
         columns[..., 0] += ax
         columns[..., 1] += ay
         where = WORLD.index(transform(T_world_ego, columns))  # x y 2 2 3
-        inside = WORLD.contains(where).all(axis=(2, 3))
+        inside: np.ndarray = WORLD.contains(where).all(axis=(2, 3))
         at = np.clip(where, 0, np.asarray(WORLD.shape) - 1)
         samples = world.labels[at[..., 0], at[..., 1], : 2 * WINDOW.shape[2]]  # x y 2 2 2z: z lattices coincide
         samples = samples.reshape(*WINDOW.shape[:2], 4, WINDOW.shape[2], 2)
@@ -140,7 +140,8 @@ def load_street(
     if not 1 <= frames <= MAX_FRAMES:
         raise ConfigError("the street is too short", expected=f"1 to {MAX_FRAMES} frames", got=frames)
     place = street(seed)
-    return FrameSequence(f"synthetic-street-{seed}", range(frames), lambda index: _frame(place, index))
+    name = f"synthetic-street-{seed}"
+    return FrameSequence(name, range(frames), lambda index: _frame(place, index), source="city", synthetic=True)
 
 
 def ego_pose(time: float) -> Float[np.ndarray, "4 4"]:

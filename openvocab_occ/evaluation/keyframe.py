@@ -14,10 +14,12 @@ from openvocab_occ.datasets.frame import Frame, FrameSequence
 from openvocab_occ.depth.render import render_depth
 from openvocab_occ.errors import ConfigError, DataError
 from openvocab_occ.geometry import invert, transform
+from openvocab_occ.mapping import keys_of
 from openvocab_occ.objects.scene_map import SceneMap
 from openvocab_occ.occupancy import OccupancyGrid
 from openvocab_occ.pipeline.build import build_map, grid_of
 from openvocab_occ.query.find import score_voxels
+from openvocab_occ.query.words import match_labels
 from openvocab_occ.segmentation.encoder import FeatureMap, PixelEncoder
 
 
@@ -127,8 +129,7 @@ def word_agreement(frame: Frame, scene: SceneMap, encoder: PixelEncoder, word: s
     assert frame.points is not None
     world = _inside(transform(frame.T_world_ego, frame.points), grid_of(frame))
     scores = score_voxels(scene, word)
-    keys = np.floor(world / scene.voxels.voxel_size).astype(np.int32)
-    position = scene.voxels.index(keys)
+    position = scene.voxels.index(keys_of(world, scene.voxels.voxel_size))
     answers = (position >= 0) & (scores[position] >= 0.5)
     channels = _channels(scene, word)
     under: list[np.ndarray] = []
@@ -163,10 +164,11 @@ def _inside(points: Float[np.ndarray, "n 3"], grid: OccupancyGrid) -> Float[np.n
 
 
 def _channels(scene: SceneMap, word: str) -> Bool[np.ndarray, " c"]:
-    """Tell which labels of a logits map answer the word: those whose voxels would score 1 if certain of them."""
-    from openvocab_occ.query.words import match_labels
-
-    return match_labels(word, scene.encoder["labels"]).channels
+    """Tell which labels of a logits map answer the word."""
+    channels = match_labels(word, scene.encoder.labels).channels
+    if not channels.any():
+        raise ConfigError("the model has no label for the word", expected=", ".join(scene.encoder.labels), got=word)
+    return channels
 
 
 def _probability(

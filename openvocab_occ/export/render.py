@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, Int64
-from numpy.typing import ArrayLike
 
+from openvocab_occ.arrays import ArrayLike
 from openvocab_occ.depth.render import render_depth
 from openvocab_occ.errors import MapError
 from openvocab_occ.geometry import Camera, GridSpec, invert, look_at, transform

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-import openvocab_occ
+from openvocab_occ._version import __version__
 from openvocab_occ.errors import ConfigError, MapError
 from openvocab_occ.export.draw import SKY, draw_view, paint
 from openvocab_occ.export.palette import NOTHING, UNLABELLED, label_colors, paint_labels
@@ -98,7 +98,7 @@ def export_views(
         "provenance": {
             **asdict(scene.provenance),
             "encoder": scene.encoder.name,
-            "exported_by": f"openvocab_occ {openvocab_occ.__version__}",
+            "exported_by": f"openvocab_occ {__version__}",
         },
     }
     text = _as_json(content)

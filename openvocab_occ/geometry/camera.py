@@ -10,9 +10,8 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
-from openvocab_occ.arrays import as_floats
+from openvocab_occ.arrays import ArrayLike, as_floats
 from openvocab_occ.errors import CameraError, OpenVocabOccError
 from openvocab_occ.geometry.pose import as_pose, invert, transform
 

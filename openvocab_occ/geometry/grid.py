@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
 
-from openvocab_occ.arrays import as_floats
+from openvocab_occ.arrays import ArrayLike, as_floats
 from openvocab_occ.errors import GridError
 
 MAX_VOXELS = 2**31 - 1  # a voxel's flat index is an int32

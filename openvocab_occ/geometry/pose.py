@@ -1,16 +1,10 @@
 """Rigid motions as 4x4 float64 matrices. `T_a_b` takes points of frame b into frame a; compose by matching letters."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
-from openvocab_occ.arrays import as_floats
+from openvocab_occ.arrays import ArrayLike, as_floats
 from openvocab_occ.errors import PoseError, ShapeError
-
-Vector = ArrayLike | Sequence[float | int]
-"""Numbers in a row; numpy's ArrayLike alone is, to a checker at run time, no tuple."""
 
 _RIGID_TOLERANCE = 1e-3  # float32 poses of real data sets are off by 1e-6; a wrong one by far more
 
@@ -56,7 +50,7 @@ def as_pose(value: ArrayLike, name: str = "pose") -> Float[np.ndarray, "4 4"]:
     return T
 
 
-def pose(translation: Vector = (0.0, 0.0, 0.0), wxyz: Vector = (1.0, 0.0, 0.0, 0.0)) -> Float[np.ndarray, "4 4"]:
+def pose(translation: ArrayLike = (0.0, 0.0, 0.0), wxyz: ArrayLike = (1.0, 0.0, 0.0, 0.0)) -> Float[np.ndarray, "4 4"]:
     """Build a pose from a translation in metres and a quaternion."""
     T = np.eye(4)
     T[:3, :3] = matrix_from_wxyz(wxyz)
@@ -79,7 +73,7 @@ def transform(T_a_b: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*n 3"]
     return points.astype(np.float64) @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
-def matrix_from_wxyz(wxyz: Vector) -> Float[np.ndarray, "3 3"]:
+def matrix_from_wxyz(wxyz: ArrayLike) -> Float[np.ndarray, "3 3"]:
     """Return the rotation of a quaternion, which need not be of unit length but not zero."""
     q = as_floats(np.asarray(wxyz), (4,), "quaternion")
     norm = float(np.linalg.norm(q))
@@ -110,7 +104,7 @@ def wxyz_from_matrix(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
     return q if q[0] >= 0 else -q
 
 
-def look_at(position: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> Float[np.ndarray, "4 4"]:
+def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Float[np.ndarray, "4 4"]:
     """Return T_world_cam of a camera at `position` that looks at `target` (x right, y down, z forward)."""
     eye = as_floats(np.asarray(position), (3,), "position")
     forward = as_floats(np.asarray(target), (3,), "target") - eye

@@ -95,6 +95,11 @@ def _encode(text: str, codec: str) -> bytes:
     return text.encode("latin1")
 
 
+def _no_bytes() -> bytes:
+    """Old protocols call bytes() for b""; any argument is a TypeError, bytes(10**12) among them."""
+    return b""
+
+
 def _no_call(*_: object) -> None:
     raise UnsafeFileError("the file calls numpy.ndarray itself", expected="only its name")
 
@@ -123,6 +128,7 @@ _ADMITTED: dict[tuple[str, str], Callable[..., Any]] = {
     ("numpy", "dtype"): _DType,
     ("_codecs", "encode"): _encode,
     ("collections", "OrderedDict"): dict,
+    **{(module, "bytes"): _no_bytes for module in ("builtins", "__builtin__")},
     **{(module, kind.__name__): kind for module in ("builtins", "__builtin__") for kind in (set, frozenset, complex)},
 }
 

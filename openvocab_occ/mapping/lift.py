@@ -20,7 +20,7 @@ from openvocab_occ.occupancy import OccupancyGrid
 from openvocab_occ.segmentation.encoder import FeatureMap
 
 if TYPE_CHECKING:
-    from scipy.sparse import csr_matrix
+    from scipy.sparse import csr_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +72,9 @@ def _bilinear_weights(
     v: Int64[np.ndarray, " p"],
     num_rows: int,
     features: FeatureMap,
-) -> "csr_matrix":
+) -> "csr_array":
     """Return W, float32 csr (num_rows x cells), of pixels (u, v) that belong to `row`."""
-    from scipy.sparse import coo_matrix
+    from scipy.sparse import coo_array
 
     height, width = features.cells.shape[:2]
     x = np.clip(features.scale[0] * u + features.offset[0], 0, width - 1)
@@ -84,7 +84,7 @@ def _bilinear_weights(
     x, y = x - left, y - top  # now fractions of a cell
     cells = np.concatenate([top * width + left, top * width + right, bottom * width + left, bottom * width + right])
     weights = np.concatenate([(1 - y) * (1 - x), (1 - y) * x, y * (1 - x), y * x])
-    W = coo_matrix((weights, (np.tile(row, 4), cells)), shape=(num_rows, height * width)).tocsr()
+    W = coo_array((weights, (np.tile(row, 4), cells)), shape=(num_rows, height * width)).tocsr()
     W.data = W.data.astype(np.float32)  # added up in float64, for many pixels go to one entry
     return W
 

@@ -2,13 +2,11 @@
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Self
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
-from numpy.typing import ArrayLike
 
-from openvocab_occ.arrays import check_finite, check_shape
+from openvocab_occ.arrays import ArrayLike, check_finite, check_shape
 from openvocab_occ.errors import GridError, ShapeError
 from openvocab_occ.geometry import GridSpec, as_pose, transform
 
@@ -95,7 +93,7 @@ class OccupancyGrid:
         free_label: int = OCC3D_FREE,
         known: Bool[np.ndarray, "x y z"] | None = None,
         class_names: tuple[str, ...] = OCC3D_CLASSES,
-    ) -> Self:
+    ) -> "OccupancyGrid":
         """Label each voxel with its best class, and keep the logits."""
         check_shape(np.asarray(logits), (*spec.shape, len(class_names)), "occupancy logits")
         labels = np.argmax(logits, axis=-1).astype(np.uint8)

@@ -4,10 +4,9 @@ import math
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
 from openvocab_occ._jit import in_slices
-from openvocab_occ.arrays import as_floats
+from openvocab_occ.arrays import ArrayLike, as_floats
 from openvocab_occ.errors import ConfigError
 from openvocab_occ.geometry import GridSpec
 from openvocab_occ.occupancy._rays_kernels import mark_crossed

@@ -7,9 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
-from numpy.typing import ArrayLike
 
-from openvocab_occ.arrays import check_shape
+from openvocab_occ.arrays import ArrayLike, check_shape
 from openvocab_occ.errors import DataError, GridError, UnsafeFileError
 from openvocab_occ.io.files import PathLike, existing, written_file
 from openvocab_occ.occupancy.grid import OCC3D_CLASSES, OCC3D_FREE, OCC3D_SPEC, OccupancyGrid

@@ -8,12 +8,12 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Int32, UInt8
 
-import openvocab_occ
+from openvocab_occ._version import __version__
 from openvocab_occ.arrays import check_shape
 from openvocab_occ.datasets.frame import Frame, View
 from openvocab_occ.depth.render import render_depth
 from openvocab_occ.errors import ConfigError, DataError, ModelError
-from openvocab_occ.geometry import invert
+from openvocab_occ.geometry import GridSpec, invert, pose, transform
 from openvocab_occ.mapping import NO_LABEL, VoxelMap, join, lift, rows_from_depth, rows_from_grid
 from openvocab_occ.objects import EncoderInfo, KeyFrame, NamedCamera, Provenance, SceneMap, group_objects
 from openvocab_occ.occupancy import OCC3D_SPEC, OccupancyGrid
@@ -24,7 +24,9 @@ GridFrom = Literal["auto", "occupancy", "lidar"]
 """Where a frame's grid comes from: its own occupancy, its LiDAR points, or (auto) the first of the two it has."""
 DEFAULT_VOXEL_SIZE = 0.1  # metres, where no grid gives one
 MAX_DEPTH = 60.0
-MIN_LIDAR_RANGE = 1.5  # metres; nearer returns are of the car that carries the LiDAR
+LIDAR_SPEC = GridSpec((0.0, 0.0, 0.0), OCC3D_SPEC.voxel_size, OCC3D_SPEC.shape)
+"""Grid carved from LiDAR returns; its corner is put on the map's lattice, its axes are the world's."""
+MIN_LIDAR_RANGE = 2.2  # metres; nearer returns are of the car under the LiDAR (nuScenes: its bonnet, up to 2.05 m)
 
 
 def build_map(
@@ -132,7 +134,7 @@ class MapBuilder:
             self._provenance,
             options={**options, **self._provenance.options},
             date=datetime.now(UTC).isoformat(timespec="seconds"),
-            version=openvocab_occ.__version__,
+            version=__version__,
         )
         return SceneMap(voxels, objects, encoder, tuple(self._frames), provenance, self._class_names)
 
@@ -177,7 +179,7 @@ class MapBuilder:
 
 
 def grid_of(frame: Frame, grid_from: GridFrom = "auto") -> OccupancyGrid:
-    """Return the frame's grid: its own, or one of Occ3D's size around the ego, carved from its LiDAR points."""
+    """Return the frame's grid: its own, or one of Occ3D's size around the ego, carved from its LiDAR returns."""
     if frame.occupancy is not None and grid_from != "lidar":
         return frame.occupancy
     if frame.points is None or grid_from == "occupancy":
@@ -195,5 +197,10 @@ def grid_of(frame: Frame, grid_from: GridFrom = "auto") -> OccupancyGrid:
             expected="the LiDAR's pose in poses['lidar']",
             got=f"poses of {', '.join(frame.poses) or 'nothing'}",
         )
-    origin = (invert(frame.T_world_ego) @ frame.poses["lidar"])[:3, 3]
-    return grid_from_lidar(frame.points, origin, OCC3D_SPEC, T_world_grid=frame.T_world_ego, min_range=MIN_LIDAR_RANGE)
+    # on the map's own lattice, so that a voxel of the grid is one of the map, from every frame
+    corner = np.floor((frame.T_world_ego[:3, 3] + OCC3D_SPEC.origin) / LIDAR_SPEC.size) * LIDAR_SPEC.size
+    T_world_grid = pose(corner)
+    T_grid_ego = invert(T_world_grid) @ frame.T_world_ego
+    points = transform(T_grid_ego, frame.points).astype(np.float32)
+    sensor = (invert(T_world_grid) @ frame.poses["lidar"])[:3, 3]
+    return grid_from_lidar(points, sensor, LIDAR_SPEC, T_world_grid=T_world_grid, min_range=MIN_LIDAR_RANGE)

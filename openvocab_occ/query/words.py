@@ -7,7 +7,6 @@ import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -91,25 +90,16 @@ def _by_form(labels: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
 
 
 def _forms(words: Sequence[str]) -> set[str]:
-    """Return the words run together, as they are and in the singular; so "dining tables" meets "diningtable"."""
+    """Return the words run together, as they are and as singular nouns; so "dining tables" meets "diningtable"."""
     if not words:
         return set()
-    return {"".join(choice) for choice in itertools.product(*[{word, singular(word)} for word in words])}
+    return {"".join(choice) for choice in itertools.product(*map(lemmas, words))}
 
 
 @lru_cache(maxsize=4096)
-def singular(word: str) -> str:
-    """Return the singular of a plural noun, any other word as it is.
+def lemmas(word: str) -> frozenset[str]:
+    """Return the nouns that a word may be a form of: leaves are leaf or leave, a bus is a bus, people are persons."""
+    from lemminflect import getLemma
 
-    inflect makes "bu" of "bus"; so a singular counts only if its plural is the word again.
-    """
-    engine = _inflect()
-    shorter = engine.singular_noun(word) if word.isalpha() else False
-    return shorter if shorter and engine.plural_noun(shorter) == word else word
-
-
-@lru_cache(maxsize=1)
-def _inflect() -> Any:
-    import inflect  # 1.7 s, so on the first query only
-
-    return inflect.engine()
+    found = {"person"} if word == "people" else set(getLemma(word, upos="NOUN"))
+    return frozenset({word, *found})

@@ -48,8 +48,11 @@ class PixelEncoder(Protocol):
     """Names of the channels of a `logits` model; empty otherwise."""
     fingerprint: str
     """sha256 that changes when the model's output would: of the model file and its card."""
-    text: TextEncoder | None
-    """The text side of a `dense` model."""
+
+    @property
+    def text(self) -> TextEncoder | None:
+        """The text side of a `dense` model."""
+        ...
 
     def encode(self, images: Sequence[UInt8[np.ndarray, "h w 3"]]) -> list[FeatureMap]:
         """Run the model on RGB images."""

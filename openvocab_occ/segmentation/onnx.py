@@ -152,7 +152,8 @@ class OnnxEncoder:
             raise self._misfit("images of 4 axes, float or uint8", str(port))
         batch, *rest = port.shape
         height, width, channels = rest if card.input.layout == "NHWC" else (*rest[1:], rest[0])
-        if channels not in (None, 3):
+        swapped = channels is None and rest[0 if card.input.layout == "NHWC" else 2] == 3
+        if channels not in (None, 3) or swapped:
             raise self._misfit(f"3 colours in layout {card.input.layout}", str(port), "check input.layout")
         if batch not in (None, 1):
             raise self._misfit("a batch of 1 or of any size", str(port), "export it so")
@@ -188,7 +189,8 @@ def prepare(image: UInt8[np.ndarray, "h w 3"], card: InputCard) -> Float32[np.nd
     import cv2
 
     height, width = card.size or _rounded(image.shape[:2], card.multiple_of or 1)
-    how = {"bilinear": cv2.INTER_LINEAR, "area": cv2.INTER_AREA, "nearest": cv2.INTER_NEAREST_EXACT}
+    # the exact ones: OpenCV 5 cuts off fractions of grey levels in INTER_LINEAR; INTER_NEAREST is off by half a pixel
+    how = {"bilinear": cv2.INTER_LINEAR_EXACT, "area": cv2.INTER_AREA, "nearest": cv2.INTER_NEAREST_EXACT}
     if image.shape[:2] != (height, width):
         image = cv2.resize(image, (width, height), interpolation=how[card.interpolation])  # pyright: ignore
     colors = image[:, :, ::-1] if card.color == "BGR" else image

@@ -73,6 +73,7 @@ def test_a_row_out_of_range_is_told(rng):
         lift(np.array([[0, 2]], np.int32), 2, feature_map(rng, 1, 1, 1))
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(*[st.integers(-(2**b), 2**b - 1) for b in (23, 23, 15)]), min_size=1))
 def test_packing_is_undone_and_keeps_the_order(keys):
     array = np.array(keys, np.int32)

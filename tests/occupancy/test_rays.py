@@ -275,7 +275,6 @@ def test_open3d_sees_the_same_boxes(rng):
     same = np.isclose(hits.distance, distance, atol=1e-4) | (np.isinf(hits.distance) & np.isinf(distance))
     assert (hits.voxel >= 0).mean() > 0.1
     assert (~same).mean() < 1e-3  # float32 triangles: a ray may graze an edge
-    print(f"Open3D differs on {(~same).sum()} of {len(same)} rays")
     both = same & (hits.voxel >= 0)
     flat = np.flatnonzero(occupied)[box[both]]
     assert (flat == hits.voxel[both]).mean() > 0.999

@@ -87,6 +87,15 @@ def test_every_label_and_its_plural_name_it(label):
         assert match_labels(text, ["x", label, "y"]).channels.tolist() == [False, True, False], text
 
 
+def test_the_longest_label_wins_also_inflected():
+    assert match_labels("traffic cones", ["traffic", "traffic cone"]).channels.tolist() == [False, True]
+
+
+def test_plain_labels_need_no_inflection(monkeypatch):
+    monkeypatch.setattr("openvocab_occ.query.words.singular", None)
+    assert match_labels("the Traffic-cone or road", LABELS).channels.sum() == 2
+
+
 def test_compound_labels_are_found_written_apart():
     assert match_labels("dining tables", ["diningtable"]).channels.all()
 
