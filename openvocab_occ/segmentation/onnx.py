@@ -70,7 +70,7 @@ class OnnxEncoder:
         self._check_declared()
         self.fingerprint = _fingerprint(card, (*session.files, *(text.files if text is not None else ())))
 
-    def encode(self, images: Sequence[UInt8[np.ndarray, "h w 3"]]) -> list[FeatureMap]:
+    def encode(self, images: Sequence[UInt8[np.ndarray, "_ _ 3"]]) -> list[FeatureMap]:
         """Run the model on RGB images of any sizes."""
         batch = self._input.shape[0] or _BATCH
         maps: list[FeatureMap] = []
