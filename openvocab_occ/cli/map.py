@@ -57,8 +57,8 @@ def summary(scene: SceneMap, path: Path) -> dict[str, Any]:
         "objects": len(scene.objects),
         "objects_by_label": dict(sorted(labels.items(), key=lambda item: (-item[1], item[0]))),
         "bytes": sum(file.stat().st_size for file in path.rglob("*") if file.is_file()),
-        "encoder": scene.encoder["name"],
-        "synthetic": bool(scene.provenance.get("synthetic", False)),
+        "encoder": scene.encoder.name,
+        "synthetic": scene.provenance.synthetic,
     }
 
 

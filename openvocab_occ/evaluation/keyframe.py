@@ -14,10 +14,12 @@ from openvocab_occ.datasets.frame import Frame, FrameSequence
 from openvocab_occ.depth.render import render_depth
 from openvocab_occ.errors import ConfigError, DataError
 from openvocab_occ.geometry import invert, transform
+from openvocab_occ.mapping import keys_of
 from openvocab_occ.objects.scene_map import SceneMap
 from openvocab_occ.occupancy import OccupancyGrid
-from openvocab_occ.pipeline.build import build_map, grid_of
+from openvocab_occ.pipeline.build import build_map, grid_from_frame
 from openvocab_occ.query.find import score_voxels
+from openvocab_occ.query.words import match_names
 from openvocab_occ.segmentation.encoder import FeatureMap, PixelEncoder
 
 
@@ -98,7 +100,7 @@ def held_out_depth(frame: Frame, *, held_out: float = 0.2, seed: int = 0) -> Dep
     """Make a grid of some of the returns and compare its depth, at each other return's pixel, with that return's."""
     assert frame.points is not None
     test = np.random.default_rng(seed).random(len(frame.points)) < held_out
-    grid = grid_of(replace(frame, points=frame.points[~test], occupancy=None))
+    grid = grid_from_frame(replace(frame, points=frame.points[~test], occupancy=None))
     points = _inside(transform(frame.T_world_ego, frame.points[test]), grid)
     errors: list[np.ndarray] = []
     asked = 0
@@ -125,10 +127,9 @@ def held_out_depth(frame: Frame, *, held_out: float = 0.2, seed: int = 0) -> Dep
 def word_agreement(frame: Frame, scene: SceneMap, encoder: PixelEncoder, word: str) -> WordAgreement:
     """Count returns in voxels that answer `word`, apart for those the word's pixels cover and those they do not."""
     assert frame.points is not None
-    world = _inside(transform(frame.T_world_ego, frame.points), grid_of(frame))
+    world = _inside(transform(frame.T_world_ego, frame.points), grid_from_frame(frame))
     scores = score_voxels(scene, word)
-    keys = np.floor(world / scene.voxels.voxel_size).astype(np.int32)
-    position = scene.voxels.index(keys)
+    position = scene.voxels.index(keys_of(world, scene.voxels.voxel_size))
     answers = (position >= 0) & (scores[position] >= 0.5)
     channels = _channels(scene, word)
     under: list[np.ndarray] = []
@@ -163,10 +164,12 @@ def _inside(points: Float[np.ndarray, "n 3"], grid: OccupancyGrid) -> Float[np.n
 
 
 def _channels(scene: SceneMap, word: str) -> Bool[np.ndarray, " c"]:
-    """Tell which labels of a logits map answer the word: those whose voxels would score 1 if certain of them."""
-    from openvocab_occ.query.words import match_labels
-
-    return match_labels(word, scene.encoder["labels"]).channels
+    """Tell which labels of a logits map answer the word."""
+    channels = np.zeros(len(scene.encoder.labels), dtype=bool)
+    channels[list(match_names(word, scene.encoder.labels).labels)] = True
+    if not channels.any():
+        raise ConfigError("the model has no label for the word", expected=", ".join(scene.encoder.labels), got=word)
+    return channels
 
 
 def _probability(

@@ -1,1 +1,4 @@
 """Maps to files that others read."""
+
+from openvocab_occ.export.views import ViewBundle as ViewBundle
+from openvocab_occ.export.views import export_views as export_views

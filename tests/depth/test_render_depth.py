@@ -87,6 +87,23 @@ def test_samples_on_lattice_points_and_in_faces_agree_with_plain_sampling(rng, s
         np.testing.assert_array_equal(t, np.array([w[0] for w in wanted], np.float32))
 
 
+@pytest.mark.parametrize("k", [1, 3, 5])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_sample_that_rounds_onto_a_face_counts_like_in_plain_sampling(k, sign):
+    """A hair before a face, o + t d rounds onto it long before the ray gets there."""
+    from openvocab_occ.depth._sampling_kernels import first_samples
+
+    occupied = np.zeros((6, 1, 1), dtype=bool)
+    occupied[k if sign > 0 else k - 1] = True
+    origin = np.array([np.nextafter(k, k - sign), 0.5, 0.5])
+    for speed in np.geomspace(1e-19, 1e-16, 40):
+        direction = np.array([[sign * speed, 0.0, 0.0]])
+        t, voxel = np.empty(1, np.float32), np.empty(1, np.int32)
+        first_samples(origin, direction, occupied, 0.5, 2500, 0, 1, t, voxel)
+        wanted = first_sample(origin, direction[0], occupied, 0.5, 2500)
+        np.testing.assert_array_equal((t[0], voxel[0]), (np.float32(wanted[0]), wanted[1]))
+
+
 def test_depth_is_range_times_the_cosine(grid):
     camera = Camera(K, 16, 11, POSES["outside"])
     rays = camera.rays().reshape(-1, 3)

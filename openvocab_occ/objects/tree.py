@@ -1,0 +1,102 @@
+"""Objects, and the tree they stand in: the scene at its root, objects below it."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from openvocab_occ.errors import ConfigError, DataError
+from openvocab_occ.objects.box import Box
+
+SCENE, OBJECT = "scene", "object"
+
+
+class Sighting(NamedTuple):
+    """Where an object is seen."""
+
+    frame: int
+    """Index of the frame."""
+    view: str
+    """Name of the view."""
+    box: tuple[int, int, int, int]
+    """Left, top, right, bottom pixel, all inclusive."""
+
+
+@dataclass(frozen=True, eq=False)
+class SceneObject:
+    """One node of the tree: a group of voxels that belong together, or the scene."""
+
+    id: int
+    label: str
+    """Best class of its voxels; empty where neither the model nor the occupancy names any."""
+    score: float
+    """How much speaks for `label`: mean probability of a `logits` model, else the share of voxels of that class."""
+    box: Box
+    voxels: Int64[np.ndarray, " n"] = field(repr=False)
+    """Positions in the VoxelMap of the same SceneMap; none for the scene, which holds all."""
+    points: Float32[np.ndarray, "n 3"] = field(repr=False)
+    """Centres of the voxels in the world, metres. Rounded by up to 0.03 mm at 1 km."""
+    embedding: Float32[np.ndarray, " c"] = field(repr=False)
+    """Mean feature of the voxels; a unit vector for a `dense` map, a distribution for a `logits` map."""
+    state: str = "unknown"
+    """What motion was observed; never guessed from appearance."""
+    level: str = OBJECT
+    parent: int | None = None
+    children: tuple[int, ...] = ()
+    views: tuple[Sighting, ...] = ()
+    """Best sightings; empty where the map was built without recording them."""
+
+    @property
+    def center(self) -> Float64[np.ndarray, " 3"]:
+        """Centre of the box, metres, world."""
+        return self.box.center
+
+
+class ObjectTree:
+    """All nodes by id. Its length and its iteration are of the objects; the root is `tree[0]`."""
+
+    def __init__(self, nodes: Iterable[SceneObject]) -> None:
+        nodes = tuple(nodes)
+        self._nodes = {node.id: node for node in nodes}
+        if len(self._nodes) != len(nodes):
+            raise DataError("object ids repeat", got=sorted(node.id for node in nodes))
+        if 0 not in self._nodes or self._nodes[0].level != SCENE:
+            raise DataError("object tree has no root", expected="node 0 of level 'scene'", got=sorted(self._nodes)[:5])
+        for node in nodes:
+            if (node.parent is None) != (node.id == 0) or (node.parent is not None and node.parent not in self._nodes):
+                raise DataError(f"object {node.id} hangs nowhere", expected="a parent in the tree", got=node.parent)
+            if any(child not in self._nodes or self._nodes[child].parent != node.id for child in node.children):
+                raise DataError(f"children of object {node.id} do not name it as parent", got=node.children)
+
+    @property
+    def root(self) -> SceneObject:
+        """The scene."""
+        return self._nodes[0]
+
+    @property
+    def nodes(self) -> tuple[SceneObject, ...]:
+        """All nodes, the scene included."""
+        return tuple(self._nodes.values())
+
+    def level(self, name: str) -> tuple[SceneObject, ...]:
+        """Return the nodes of a level; none when the tree has no such level."""
+        return tuple(node for node in self._nodes.values() if node.level == name)
+
+    def __len__(self) -> int:
+        return len(self.level(OBJECT))
+
+    def __iter__(self) -> Iterator[SceneObject]:
+        return iter(self.level(OBJECT))
+
+    def __contains__(self, id: object) -> bool:
+        return id in self._nodes
+
+    def __getitem__(self, id: int) -> SceneObject:
+        if id not in self._nodes:
+            raise ConfigError("no object has this id", expected=f"one of {len(self._nodes)} ids from 0", got=id)
+        return self._nodes[id]
+
+    def __repr__(self) -> str:
+        return f"ObjectTree({len(self)} objects)"

@@ -1,0 +1,199 @@
+"""The spine: frames become a map."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Int32, UInt8
+
+import openvocab_occ
+from openvocab_occ.arrays import check_shape
+from openvocab_occ.datasets.frame import Frame, View
+from openvocab_occ.depth.render import render_depth
+from openvocab_occ.errors import ConfigError, DataError, ModelError
+from openvocab_occ.geometry import invert
+from openvocab_occ.mapping import NO_LABEL, VoxelMap, join, lift, rows_from_depth, rows_from_grid
+from openvocab_occ.objects import EncoderInfo, KeyFrame, NamedCamera, Provenance, SceneMap, group_objects
+from openvocab_occ.occupancy import OCC3D_SPEC, OccupancyGrid
+from openvocab_occ.occupancy.lidar import grid_from_lidar
+from openvocab_occ.segmentation.encoder import FeatureMap, PixelEncoder
+
+GridFrom = Literal["auto", "occupancy", "lidar"]
+"""Where a frame's grid comes from: its own occupancy, its LiDAR points, or (auto) the first of the two it has."""
+DEFAULT_VOXEL_SIZE = 0.1  # metres, where no grid gives one
+MAX_DEPTH = 60.0
+MIN_LIDAR_RANGE = 1.5  # metres; nearer returns are of the car that carries the LiDAR
+
+
+def build_map(
+    sequence: Sequence[Frame],
+    encoder: PixelEncoder,
+    *,
+    voxel_size: float | None = None,
+    max_depth: float = MAX_DEPTH,
+    progress: Callable[[int, int], object] | None = None,
+    provenance: Provenance | None = None,
+) -> SceneMap:
+    """Build a map from all frames of a sequence.
+
+    `progress` is called with the number of frames done and their total. See `MapBuilder` for the other arguments.
+    """
+    if not len(sequence):
+        raise DataError("sequence has no frames", expected="at least 1", got=0, fix="check the path and the slice")
+    if provenance is None:  # a plain list of frames will do, and has no name
+        made_up = bool(getattr(sequence, "synthetic", False))
+        provenance = Provenance(name=str(getattr(sequence, "name", "")), synthetic=made_up)
+    builder = MapBuilder(encoder, voxel_size=voxel_size, max_depth=max_depth, provenance=provenance)
+    for done, frame in enumerate(sequence, start=1):
+        builder.integrate(frame)
+        if progress is not None:
+            progress(done, len(sequence))
+    return builder.snapshot()
+
+
+class MapBuilder:
+    """Grows a map frame by frame."""
+
+    def __init__(
+        self,
+        encoder: PixelEncoder,
+        *,
+        voxel_size: float | None = None,
+        max_depth: float = MAX_DEPTH,
+        grid_from: GridFrom = "auto",
+        provenance: Provenance | None = None,
+    ) -> None:
+        """Begin with an empty map.
+
+        Args:
+            encoder: Makes the features of all frames.
+            voxel_size: Metres; None takes the first grid's, or 0.1 where depth was measured instead.
+            max_depth: Pixels that see nothing within this z-depth, metres, add nothing.
+            grid_from: Where the grid of a frame comes from. Views with measured depth need none.
+            provenance: What the map's file says about its source; options, date and version are filled in.
+        """
+        if not (np.isfinite(max_depth) and max_depth > 0):
+            raise ConfigError("max_depth is not usable", expected="a distance above 0 m", got=max_depth)
+        if grid_from not in get_args(GridFrom):
+            raise ConfigError("grid_from is not known", expected=" or ".join(get_args(GridFrom)), got=grid_from)
+        if encoder.contract == "logits" and len(encoder.labels) != encoder.dim:
+            raise ModelError(
+                f"encoder {encoder.name} does not name its channels", expected=encoder.dim, got=len(encoder.labels)
+            )
+        if voxel_size is not None:
+            VoxelMap(voxel_size, encoder.dim, contract=encoder.contract)  # raises now rather than at the first frame
+        self._encoder = encoder
+        self._voxel_size = voxel_size
+        self._max_depth = float(max_depth)
+        self._grid_from: GridFrom = grid_from
+        self._provenance = provenance or Provenance()
+        self._voxels: VoxelMap | None = None
+        self._class_names: tuple[str, ...] = ()
+        self._frames: list[KeyFrame] = []
+
+    def integrate(self, frame: Frame) -> None:
+        """Add one frame. When it raises, the map is as it was before."""
+        if not frame.views:
+            raise DataError(f"frame {frame.index} has no views", expected="at least one image with its camera")
+        # occupancy: the frame's own grid, or one from its LiDAR points
+        grid = self._grid(frame) if any(view.depth is None for view in frame.views) else None
+        voxel_size = self._size(grid)
+        # depth: which voxel each pixel sees (Eq. 5-9)
+        seen = [self._see(view, grid, voxel_size) for view in frame.views]
+        # features: cells of the images, added up over the pixels of each voxel
+        cells = self._encoder.encode([view.image for view in frame.views])
+        self._check(cells, frame)
+        lifted = [
+            lift(rows, len(keys), features, image=view.image)
+            for view, (rows, keys, _), features in zip(frame.views, seen, cells, strict=True)
+        ]
+        # voxels: added to what earlier frames saw
+        voxels = self._voxels
+        if voxels is None:
+            voxels = VoxelMap(voxel_size, self._encoder.dim, contract=self._encoder.contract)
+        keys, labels = (np.concatenate([part[i] for part in seen]) for i in (1, 2))
+        voxels.integrate(keys, join(lifted), time=frame.timestamp, labels=labels)
+        self._voxels = voxels
+        self._class_names = self._class_names or (grid.class_names if grid is not None else ())
+        cameras = tuple(NamedCamera.of(view.camera, view.name) for view in frame.views)
+        self._frames.append(KeyFrame(frame.index, frame.timestamp, frame.T_world_ego, cameras))
+
+    def snapshot(self) -> SceneMap:
+        """Return the map of all frames so far; it does not change when more follow."""
+        if self._voxels is None:
+            raise DataError("there is no map yet", expected="at least 1 frame", got=0, fix="integrate a frame first")
+        encoder = EncoderInfo.of(self._encoder)
+        voxels = self._voxels.copy()
+        objects = group_objects(voxels, labels=encoder.labels, class_names=self._class_names)
+        options = {"voxel_size": voxels.voxel_size, "max_depth": self._max_depth, "grid_from": self._grid_from}
+        provenance = replace(
+            self._provenance,
+            options={**options, **self._provenance.options},
+            date=datetime.now(UTC).isoformat(timespec="seconds"),
+            version=openvocab_occ.__version__,
+        )
+        return SceneMap(voxels, objects, encoder, tuple(self._frames), provenance, self._class_names)
+
+    def _grid(self, frame: Frame) -> OccupancyGrid:
+        grid = grid_of(frame, self._grid_from)
+        if self._class_names and grid.class_names != self._class_names:
+            raise DataError(
+                f"grid of frame {frame.index} has other classes than those before",
+                expected=", ".join(self._class_names),
+                got=", ".join(grid.class_names),
+            )
+        return grid
+
+    def _size(self, grid: OccupancyGrid | None) -> float:
+        if self._voxels is not None:
+            return self._voxels.voxel_size
+        if self._voxel_size is not None:
+            return float(self._voxel_size)
+        if grid is None:
+            return DEFAULT_VOXEL_SIZE
+        if np.ptp(grid.spec.size) > 0:
+            raise ConfigError("the grid's voxels are not cubes", got=grid.spec.voxel_size, fix="pass voxel_size")
+        return float(grid.spec.size[0])
+
+    def _see(
+        self, view: View, grid: OccupancyGrid | None, voxel_size: float
+    ) -> tuple[Int32[np.ndarray, "h w"], Int32[np.ndarray, "m 3"], UInt8[np.ndarray, " m"]]:
+        """Return each pixel's row, and each row's key and occupancy class."""
+        if view.depth is not None:
+            rows, keys = rows_from_depth(view.depth, view.camera, voxel_size, max_depth=self._max_depth)
+            return rows, keys, np.full(len(keys), NO_LABEL, dtype=np.uint8)
+        assert grid is not None, "integrate makes a grid when a view has no depth"
+        return rows_from_grid(render_depth(grid, view.camera, max_depth=self._max_depth), grid, voxel_size)
+
+    def _check(self, cells: Sequence[FeatureMap], frame: Frame) -> None:
+        if len(cells) != len(frame.views):
+            raise ModelError(
+                f"encoder {self._encoder.name} lost images", expected=f"{len(frame.views)} outputs", got=len(cells)
+            )
+        for features in cells:
+            check_shape(features.cells, (None, None, self._encoder.dim), f"output of encoder {self._encoder.name}")
+
+
+def grid_of(frame: Frame, grid_from: GridFrom = "auto") -> OccupancyGrid:
+    """Return the frame's grid: its own, or one of Occ3D's size around the ego, carved from its LiDAR points."""
+    if frame.occupancy is not None and grid_from != "lidar":
+        return frame.occupancy
+    if frame.points is None or grid_from == "occupancy":
+        have = {"occupancy": frame.occupancy, "LiDAR points": frame.points}
+        wanted = {"auto": "occupancy, LiDAR points", "lidar": "LiDAR points", "occupancy": "occupancy"}[grid_from]
+        raise DataError(
+            f"frame {frame.index} does not say where things are",
+            expected=f"{wanted} or measured depth in every view",
+            got=", ".join(name for name, value in have.items() if value is not None) or "none of them",
+            fix="pass load_sequence(..., occupancy=PATTERN), or views with depth",
+        )
+    if "lidar" not in frame.poses:
+        raise DataError(
+            f"frame {frame.index} cannot be carved from its LiDAR points",
+            expected="the LiDAR's pose in poses['lidar']",
+            got=f"poses of {', '.join(frame.poses) or 'nothing'}",
+        )
+    origin = (invert(frame.T_world_ego) @ frame.poses["lidar"])[:3, 3]
+    return grid_from_lidar(frame.points, origin, OCC3D_SPEC, T_world_grid=frame.T_world_ego, min_range=MIN_LIDAR_RANGE)

@@ -1,0 +1,138 @@
+"""Who may talk to the viewer: this machine, through pages the viewer itself served, and nobody else.
+
+viser binds to every interface, takes the next port when one is busy, answers any web page that knows the port, and
+opens a public tunnel when a client asks. All four are closed here.
+"""
+
+import contextlib
+import errno
+import http
+import ipaddress
+import socket
+import threading
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, Protocol
+from urllib.parse import urlsplit
+
+from openvocab_occ.errors import ConfigError
+
+if TYPE_CHECKING:
+    import viser
+
+_building = threading.Lock()  # construction swaps a name of the websockets module
+
+
+class Headers(Protocol):
+    """The headers of an HTTP request."""
+
+    def get_all(self, key: str) -> list[str]:
+        """Return every value of a header."""
+        ...
+
+
+def is_loopback(host: str) -> bool:
+    """Tell whether a host name means this machine, without asking a name server."""
+    if host.lower() == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def refusal(headers: Headers) -> str | None:
+    """Return why a request must be answered 403, or None.
+
+    The Host must name this machine, which stops pages that rebind their own name to 127.0.0.1; a port is not compared,
+    since an SSH tunnel may use another. The Origin, which browsers always send with a websocket, must be that same
+    host, which stops every other page. A program that is no browser sends none and may connect.
+    """
+    hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+    try:
+        name = urlsplit(f"//{hosts[0]}").hostname if len(hosts) == 1 and "@" not in hosts[0] else None
+        if name is None or not is_loopback(name):
+            return "this viewer answers only to its own machine"
+        if len(origins) > 1 or (origins and urlsplit(origins[0]).netloc != hosts[0]):
+            return "this viewer answers only to its own page"
+    except ValueError:  # brackets that enclose no address
+        return "host or origin cannot be read"
+    return None
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """Bind a TCP socket on this machine; port 0 takes any free one.
+
+    Raises:
+        ConfigError: The host is not this machine, or the port is taken or not allowed.
+    """
+    if not is_loopback(host):
+        raise ConfigError(
+            "the viewer has no password, so it serves this machine only",
+            expected="127.0.0.1, localhost or ::1",
+            got=host,
+            fix=f"to look from another machine, open a tunnel there: ssh -L {port}:127.0.0.1:{port} user@this-machine",
+        )
+    if not 0 <= port <= 65535:
+        raise ConfigError("port is out of range", expected="0 to 65535", got=port)
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    bound = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port just left is free; one in use is not
+        bound.bind(("127.0.0.1" if host.lower() == "localhost" else host, port))
+        bound.listen()
+    except OSError as error:
+        bound.close()
+        if error.errno == errno.EADDRINUSE:
+            raise ConfigError(f"port {port} is taken", fix="stop the other program or pass another --port") from error
+        raise ConfigError(f"port {port} cannot be opened on {host}", got=error.strerror) from error
+    return bound
+
+
+def guarded_server(host: str, port: int, label: str) -> "viser.ViserServer":
+    """Start a viser server behind `refusal`, on exactly this port, that cannot be shared through a tunnel."""
+    import viser
+    import viser._messages
+    import websockets.asyncio.server as websockets
+
+    bound = listen(host, port)
+    original = websockets.serve
+
+    def serve(handler: Any, _host: str, _port: int, *, process_request: Any, **options: Any) -> Any:
+        def checked(connection: Any, request: Any) -> Any:
+            reason = refusal(request.headers)
+            if reason is not None:
+                return connection.respond(http.HTTPStatus.FORBIDDEN, reason + "\n")
+            return process_request(connection, request)
+
+        return original(handler, sock=bound, process_request=checked, **options)
+
+    with _building, _quiet_console():
+        websockets.serve = serve  # viser offers no hook of its own; its thread looks the name up while it starts
+        try:
+            server = viser.ViserServer(host=host, port=bound.getsockname()[1], label=label, verbose=False)
+        except BaseException:
+            bound.close()
+            raise
+        finally:
+            websockets.serve = original
+    server._websock_server.unregister_handler(viser._messages.ShareUrlRequest)
+    return server
+
+
+def stop(server: "viser.ViserServer") -> None:
+    """Stop a server without the line viser prints."""
+    with _quiet_console():
+        server.stop()
+
+
+@contextlib.contextmanager
+def _quiet_console() -> Iterator[None]:
+    """Keep viser's banner off stdout, which belongs to the caller."""
+    import rich
+
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before

@@ -1,0 +1,138 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from openvocab_occ.depth.render import render_depth
+from openvocab_occ.errors import DataError, ShapeError
+from openvocab_occ.geometry import Camera, GridSpec, look_at, pose
+from openvocab_occ.mapping import join, keys_of, lift, rows_from_depth, rows_from_grid
+from openvocab_occ.mapping._lift_reference import lift_reference
+from openvocab_occ.mapping.keys import pack, unpack
+from openvocab_occ.occupancy import OccupancyGrid
+from openvocab_occ.segmentation.encoder import FeatureMap
+
+
+def feature_map(rng, h, w, c, *, stride=4.0, shift=0.0):
+    cells = rng.normal(size=(h, w, c)).astype(np.float32)
+    return FeatureMap(cells, (1 / stride, 1 / stride), (0.5 / stride - 0.5 + shift, 0.5 / stride - 0.5))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    size=st.tuples(st.integers(1, 20), st.integers(1, 20)),
+    cells=st.tuples(st.integers(1, 6), st.integers(1, 6), st.integers(1, 3)),
+    stride=st.sampled_from([0.5, 1.0, 3.7, 16.0]),
+    shift=st.sampled_from([0.0, -9.0, 30.0]),
+)
+def test_lift_is_the_sum_of_upsampled_pixels(seed, size, cells, stride, shift):
+    rng = np.random.default_rng(seed)
+    rows = rng.integers(-1, 5, size=size).astype(np.int32)
+    features = feature_map(rng, *cells, stride=stride, shift=shift)
+    lifted = lift(rows, 5, features)
+    np.testing.assert_allclose(lifted.sums, lift_reference(rows, 5, features), atol=1e-4)
+
+
+def test_weights_and_constant_features_are_conserved(rng):
+    rows = rng.integers(-1, 40, size=(90, 160)).astype(np.int32)
+    constant = FeatureMap(np.ones((6, 10, 2), np.float32), (1 / 16, 1 / 16), (-0.46875, -0.46875))
+    lifted = lift(rows, 40, constant)
+    assert lifted.weight.sum() == lifted.pixels.sum() == (rows >= 0).sum()
+    np.testing.assert_allclose(lifted.sums, lifted.weight[:, None] * [1, 1], rtol=1e-5)
+
+
+def test_colours_add_up_and_a_row_without_pixels_is_zero(rng):
+    rows = np.array([[0, 0], [2, -1]], np.int32)
+    image = rng.integers(0, 256, size=(2, 2, 3), dtype=np.uint8)
+    lifted = lift(rows, 3, feature_map(rng, 1, 1, 4), image=image)
+    np.testing.assert_array_equal(lifted.color_sum, [image[0].sum(0), [0, 0, 0], image[1, 0]])
+    assert not lifted.sums[1].any()
+    assert lifted.weight[1] == 0
+
+
+def test_agreement_is_one_for_equal_and_nought_for_opposite_features():
+    cells = np.array([[[1, 0], [1, 0], [-1, 0]]], np.float32)
+    lifted = lift(np.array([[0, 0, 1], [0, 0, 0]], np.int32)[:1], 2, FeatureMap(cells, (1.0, 1.0), (0.0, 0.0)))
+    np.testing.assert_allclose(np.linalg.norm(lifted.sums, axis=1) / lifted.weight, [1, 1])
+    lifted = lift(np.array([[0, -1, 0]], np.int32), 1, FeatureMap(cells, (1.0, 1.0), (0.0, 0.0)))
+    assert np.linalg.norm(lifted.sums[0]) == 0
+
+
+def test_joined_lifts_are_the_parts_below_one_another(rng):
+    rows = rng.integers(-1, 3, size=(8, 9)).astype(np.int32)
+    features, image = feature_map(rng, 3, 3, 2), np.zeros((8, 9, 3), np.uint8)
+    both = join([lift(rows, 3, features, image=image), lift(rows, 3, features, image=image)])
+    np.testing.assert_array_equal(both.sums[:3], both.sums[3:])
+    assert both.color_sum is not None
+    assert join([lift(rows, 3, features, image=image), lift(rows, 3, features)]).color_sum is None
+
+
+def test_a_row_out_of_range_is_told(rng):
+    with pytest.raises(ShapeError, match=r"rows are out of range: expected -1\.\.1, got 0\.\.2"):
+        lift(np.array([[0, 2]], np.int32), 2, feature_map(rng, 1, 1, 1))
+
+
+@given(st.lists(st.tuples(*[st.integers(-(2**b), 2**b - 1) for b in (23, 23, 15)]), min_size=1))
+def test_packing_is_undone_and_keeps_the_order(keys):
+    array = np.array(keys, np.int32)
+    packed = pack(array)
+    np.testing.assert_array_equal(unpack(packed), array)
+    np.testing.assert_array_equal(np.argsort(packed, kind="stable"), np.lexsort(array.T[::-1]))
+
+
+def test_grid_layers_centred_on_faces_of_the_lattice_stay_apart():
+    spec = GridSpec((-40.0, -40.0, -1.0), 0.4, (200, 200, 16))
+    z = spec.centers(np.stack([np.zeros(16, int), np.zeros(16, int), np.arange(16)], axis=1))
+    np.testing.assert_array_equal(keys_of(z, 0.4)[:, 2], np.arange(16) - 2)
+
+
+@pytest.mark.parametrize("point", [[1e9, 0, 0], [0, 0, -1e6], [np.nan, 0, 0]])
+def test_points_out_of_reach_are_told(point):
+    with pytest.raises(DataError, match=r"outside the reach of the voxel map.*subtract a local origin"):
+        keys_of(np.array([point], np.float64), 0.1)
+
+
+def wall_scene(turn=0.0):
+    """A wall one voxel thick at x = 8 m of the grid, seen by a camera at its origin that looks along x."""
+    labels = np.full((20, 20, 16), 17, np.uint8)
+    labels[16] = 15
+    wxyz = (np.cos(turn / 2), 0, 0, np.sin(turn / 2))
+    grid = OccupancyGrid(
+        labels,
+        GridSpec((0.0, -5.0, -4.0), 0.5, labels.shape),
+        pose(np.array([100.0, 50.0, 1.0]), np.array(wxyz, float)),
+    )
+    T = grid.T_world_grid @ look_at(np.array([0.2, 0.1, 0.1]), np.array([5.0, 0.1, 0.1]))
+    return grid, Camera(np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]]), 64, 48, T)
+
+
+def test_grid_and_measured_depth_find_the_same_wall():
+    grid, camera = wall_scene()
+    image = render_depth(grid, camera, max_depth=30.0)
+    rows, keys, labels = rows_from_grid(image, grid, 0.5)
+    assert (labels == 15).all()
+    assert (rows >= 0).all()
+    # depth just inside the voxels, as a sensor with a small bias would give
+    rows2, keys2 = rows_from_depth(image.depth + np.float32(0.001), camera, 0.5)
+    np.testing.assert_array_equal(keys[rows], keys2[rows2])
+
+
+def test_rows_point_at_the_voxel_each_pixel_sees_in_a_turned_grid():
+    grid, camera = wall_scene(turn=0.6)
+    image = render_depth(grid, camera, max_depth=30.0)
+    rows, keys, _ = rows_from_grid(image, grid, 0.5)
+    hit = image.voxel >= 0
+    np.testing.assert_array_equal(rows >= 0, hit)
+    np.testing.assert_array_equal(keys[rows[hit]], np.floor(grid.centers(image.voxel[hit]) / 0.5))
+
+
+def test_measured_depth_that_is_none_adds_nothing():
+    _, camera = wall_scene()
+    depth = np.zeros((48, 64), np.float32)
+    depth[0, :4] = [np.nan, np.inf, 50.0, 3.0]
+    rows, keys = rows_from_depth(depth, camera, 0.5, max_depth=40.0)
+    assert len(keys) == 1
+    assert np.argwhere(rows >= 0).tolist() == [[0, 3]]
+    with pytest.raises(DataError, match="measured depth is negative"):
+        rows_from_depth(-depth, camera, 0.5)
