@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from string import Formatter
+from typing import Any
 
 import numpy as np
 
@@ -91,9 +92,10 @@ def read_prediction(
     file = existing(path, f"{what} file")
     try:
         with file.open("rb") as stream:
-            content = np.load(stream, allow_pickle=False)
-            arrays = {key: content[key] for key in content.files} if isinstance(content, np.lib.npyio.NpzFile) else None
-            return _grid(*_choose(file.name, content if arrays is None else arrays), grid, T, file.name)
+            content: Any = np.load(stream, allow_pickle=False)
+            if isinstance(content, np.lib.npyio.NpzFile):
+                content = {key: content[key] for key in content.files}
+            return _grid(*_choose(file.name, content), grid, T, file.name)
     except OpenVocabOccError:
         raise
     except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:

@@ -11,7 +11,7 @@ from jaxtyping import Float32, UInt8
 from openvocab_occ.errors import ModelError
 from openvocab_occ.io.files import PathLike, existing, sha256
 from openvocab_occ.segmentation.card import Card, InputCard, find_card, read_card
-from openvocab_occ.segmentation.encoder import Contract, FeatureMap, PixelEncoder
+from openvocab_occ.segmentation.encoder import Contract, FeatureMap, PixelEncoder, TextEncoder
 from openvocab_occ.segmentation.session import Port, Session
 from openvocab_occ.segmentation.text import OnnxTextEncoder
 
@@ -62,7 +62,7 @@ class OnnxEncoder:
         self.name = card.name
         self.contract: Contract = card.contract
         self.labels = card.labels
-        self.text = text
+        self.text: TextEncoder | None = text
         self.dim = len(card.labels) if text is None else text.dim
         self._session = session
         self._input = session.input(card.input.name)
