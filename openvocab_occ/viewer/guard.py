@@ -11,7 +11,7 @@ import ipaddress
 import socket
 import threading
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 from urllib.parse import urlsplit
 
 from openvocab_occ.errors import ConfigError
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 _building = threading.Lock()  # construction swaps a name of the websockets module
 
 
+@runtime_checkable
 class Headers(Protocol):
     """The headers of an HTTP request."""
 

@@ -39,12 +39,11 @@ class Viewer:
         def enter(client: "viser.ClientHandle") -> None:
             self.panels[client.client_id] = Panel(client, scene, self._tiles, encoder, self._mode)
 
-        server.on_client_connect(enter)
-        threading.Thread(target=_warm_up, args=(scene, encoder), daemon=True).start()
-
         def leave(client: "viser.ClientHandle") -> None:
             self.panels.pop(client.client_id, None)
 
+        server.on_client_connect(enter)
+        threading.Thread(target=_warm_up, args=(scene, encoder), daemon=True).start()
         server.on_client_disconnect(leave)
 
     @property

@@ -62,7 +62,9 @@ def ask(page, panel, text):
     label = page.locator("label", has_text="Find")
     box = label.locator("xpath=ancestor::div[contains(@class,'Flex-root')][1]").locator("input")
     before = (panel.status.content, panel.answer)
+    page.wait_for_timeout(120)  # no faster than a person: of two messages within 50 ms viser's page sends the later
     box.fill(text)
+    page.wait_for_timeout(120)
     box.press("Enter")
     until(page, lambda: panel.status.content != before[0] or panel.answer is not before[1])
 
@@ -143,8 +145,9 @@ def test_the_latest_query_wins(browser, viewer, monkeypatch):
         threads[0].start()
         assert started.wait(10)
         for later in threads[1:]:
+            ticket = panel._ticket
             later.start()
-            time.sleep(0.05)  # the order in which they ask
+            until(page, lambda ticket=ticket: panel._ticket > ticket)  # the order in which they ask
         shown = []
         monkeypatch.setattr(panel, "_show", lambda: shown.append(panel.answer.text))
         release.set()

@@ -1,0 +1,287 @@
+"""View bundles: pictures and JSON that agree with each other, with the map and with geometry."""
+
+import dataclasses
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from openvocab_occ.depth.render import render_depth
+from openvocab_occ.errors import AlreadyExistsError, ConfigError, MapError
+from openvocab_occ.export import export_views, views
+from openvocab_occ.export.palette import NOTHING
+from openvocab_occ.export.render import overview_camera, owners, pinhole, render_map
+from openvocab_occ.export.semantics import name_voxels
+from openvocab_occ.geometry import Camera, GridSpec, look_at, pose, transform
+from openvocab_occ.io.images import read_depth, read_image
+from openvocab_occ.mapping import VoxelMap
+from openvocab_occ.objects import ObjectTree
+from openvocab_occ.occupancy import GEOMETRY_CLASSES, OccupancyGrid
+from openvocab_occ.query.find import find
+
+
+@pytest.fixture(scope="module")
+def bundle(street, tmp_path_factory):
+    return export_views(street, tmp_path_factory.mktemp("views") / "out", width=512, height=288)
+
+
+@pytest.fixture(scope="module")
+def view(bundle):
+    return json.loads((bundle.folder / "view.json").read_text())
+
+
+def whole_grid(scene):
+    """The map as one dense grid with nothing left out, and the map's position of each voxel."""
+    keys = scene.voxels.keys.astype(np.int64)
+    low, shape = keys.min(axis=0), np.ptp(keys, axis=0) + 1
+    spec = GridSpec(tuple((low * 0.4).tolist()), 0.4, tuple(shape.tolist()))
+    at = np.full(spec.num_voxels, -1)
+    at[spec.flat(keys - low)] = np.arange(len(keys))
+    labels = np.where(at >= 0, 0, 1).astype(np.uint8).reshape(spec.shape)
+    return OccupancyGrid(labels, spec, free_label=1, class_names=GEOMETRY_CLASSES), at
+
+
+CAMERAS = {
+    "along the street": pinhole(97, 61, 1.0, look_at((-25, 1, 1.7), (10, 0, 1))),
+    "straight down": pinhole(60, 60, 1.2, look_at((0, 0, 40), (0, 0, 0))),
+    "inside a building": pinhole(40, 40, 1.5, look_at((4, -15, 5), (4, 0, 5))),
+    "rolled and outside": pinhole(80, 50, 0.6, look_at((60, 40, 30), (0, 0, 0), up=(0.3, 0.4, 1))),
+    "fisheye": Camera(np.array([[30.0, 0, 49.5], [0, 30, 49.5], [0, 0, 1]]), 100, 100, look_at((-5, 0, 2), (9, 3, 1)),
+                      (0.02, -0.01, 0.002, 0.0), "fisheye"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_the_window_shows_what_the_whole_map_shows(street, camera):
+    view = render_map(street, camera, max_depth=60.0)
+    grid, at = whole_grid(street)
+    truth = render_depth(grid, camera, max_depth=60.0)
+    voxel = np.where(truth.voxel >= 0, at[truth.voxel], -1)
+    assert (voxel >= 0).any()
+    assert (view.voxel == voxel).mean() > 0.999  # rays along faces may fall to either side
+    np.testing.assert_allclose(view.depth[view.voxel == voxel], truth.depth[view.voxel == voxel], atol=1e-3)
+    assert (view.depth[view.voxel < 0] == 60.0).all()
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_points_at_their_depth_lie_on_their_voxels(street, camera):
+    view = render_map(street, camera, max_depth=60.0)
+    hit = view.voxel >= 0
+    points = transform(camera.T_world_cam, (camera.rays() * view.depth[..., None])[hit])
+    off = np.abs(points - street.voxels.centers[view.voxel[hit]]).max(axis=1)
+    assert off.max() < 0.2 + 1e-3
+    outside = view.depth[hit] > 0
+    assert np.abs(off[outside] - 0.2).max() < 1e-3  # on a face, not within
+
+
+def test_voxels_belong_to_the_smallest_object_that_holds_them(street):
+    owner = owners(street)
+    for item in street.objects:
+        assert (owner[item.voxels] == item.id).all()
+    whole = street.objects[1]
+    few = {"voxels": whole.voxels[:5], "points": whole.points[:5]}
+    inner = dataclasses.replace(whole, id=99, parent=1, label="door", **few)
+    nodes = [dataclasses.replace(n, children=(99,)) if n.id == 1 else n for n in street.objects.nodes]
+    nested = dataclasses.replace(street, objects=ObjectTree([*nodes, inner]))
+    assert (owners(nested)[inner.voxels] == 99).all()
+
+
+def test_json_and_pictures_agree(bundle, view):
+    instance = read_depth(bundle.paths["instance.png"])
+    assert set(np.unique(instance)) == {0, *(item["instance"] for item in view["objects"])}
+    for item in view["objects"]:
+        v, u = np.nonzero(instance == item["instance"])
+        assert item["visible_px"] == len(u)
+        assert item["bbox_2d"] == [u.min(), v.min(), u.max(), v.max()]
+    assert [item["range_m"] for item in view["objects"]] == sorted(item["range_m"] for item in view["objects"])
+
+
+def test_the_palette_decodes_to_the_legend(bundle, view, street):
+    image = read_image(bundle.paths["semantic.png"])
+    colors, counts = np.unique(image.reshape(-1, 3), axis=0, return_counts=True)
+    found = dict(zip(map(tuple, colors.tolist()), counts.tolist(), strict=True))
+    nothing = found.pop(NOTHING)
+    assert found == {tuple(entry["rgb"]): entry["visible_px"] for entry in view["legend"]}
+    assert view["coverage"] == pytest.approx(1 - nothing / image[..., 0].size, abs=1e-4)
+    label = {tuple(entry["rgb"]): entry["label"] for entry in view["legend"]}
+    instance = read_depth(bundle.paths["instance.png"])
+    for item in view["objects"]:
+        rgb = image[instance == item["instance"]]
+        assert {label[tuple(color)] for color in np.unique(rgb, axis=0).tolist()} == {item["label"]}
+
+
+def test_objects_reproject_into_their_boxes_from_the_json_alone(view, street):
+    camera = view["camera"]
+    T, K = np.array(camera["T_world_cam"]), np.array(camera["K"])
+    compact = [
+        item for item in view["objects"] if item["label"] in ("car", "truck", "person") and item["visible_px"] > 60
+    ]
+    checked = 0
+    for item in compact:
+        x, y, z = np.linalg.inv(T) @ [*item["center_world"], 1.0] @ np.eye(4)[:, :3]
+        u, v = (K @ [x / z, y / z, 1.0])[:2]
+        if 0 <= u < camera["width"] and 0 <= v < camera["height"]:
+            left, top, right, bottom = item["bbox_2d"]
+            assert left - 1 <= u <= right + 1
+            assert top - 1 <= v <= bottom + 1
+            checked += 1
+    assert checked >= 3
+
+
+def test_positions_against_the_ego(view, street):
+    T = np.array(view["ego"]["T_world_ego"])
+    np.testing.assert_allclose(T, street.frames[1].T_world_ego)  # of the middle keyframe
+    assert view["camera"]["name"] == "CAM_FRONT"
+    for item in view["objects"]:
+        back = T @ [*item["center_ego"], 1.0]
+        np.testing.assert_allclose(back[:3], item["center_world"], atol=1e-5)
+        assert np.sign(item["bearing_deg"]) == np.sign(item["center_ego"][1])  # left is positive
+        distance = np.linalg.norm(np.subtract(item["center_world"], np.array(view["camera"]["T_world_cam"])[:3, 3]))
+        assert item["range_m"] == pytest.approx(distance, abs=0.006)
+
+
+def test_depth_is_that_of_the_camera_in_the_json(bundle, view, street):
+    camera = Camera(np.array(view["camera"]["K"]), 512, 288, np.array(view["camera"]["T_world_cam"]))
+    assert view["camera"]["pixel_center"] == "integer"
+    rendered = render_map(street, camera)
+    stored = read_depth(bundle.paths["depth.png"])
+    assert ((stored == 0) == (rendered.voxel < 0)).mean() > 0.9999
+    both = (stored > 0) & (rendered.voxel >= 0)
+    off = np.abs(stored[both] / view["files"]["depth.png"]["scale"] - rendered.depth[both])
+    assert np.quantile(off, 0.999) <= 0.5 / 256 + 1e-3
+
+
+def test_the_camera_is_scaled_whole(bundle, view, street, tmp_path):
+    original = street.frames[1].cameras[0]
+    assert np.array(view["camera"]["K"])[0, 0] == pytest.approx(original.K[0, 0] * 512 / 1600)
+    tall = export_views(street, tmp_path / "tall", width=320, height=1000).view["camera"]
+    assert (tall["width"], tall["height"]) == (320, 180)
+    assert read_image(tmp_path / "tall" / "view.png").shape == (180, 320, 3)
+
+
+def test_a_query_is_told_and_its_hits_keep_their_colour(street, tmp_path):
+    answer = find(street, "trucks")
+    bundle = export_views(street, tmp_path / "asked", query=answer, width=256, height=144)
+    assert bundle.view["query"] == {
+        "text": "trucks",
+        "verdict": "found",
+        "threshold": 0.5,
+        "hits": [{"id": hit.object.id, "score": round(hit.score, 4)} for hit in answer.hits],
+    }
+    image = read_image(bundle.paths["view.png"]).astype(int)
+    instance = read_depth(bundle.paths["instance.png"])
+    colourful = np.ptp(image, axis=-1) > 40
+    trucks = [item["instance"] for item in bundle.view["objects"] if item["label"] == "truck"]
+    assert colourful[np.isin(instance, trucks)].mean() > 0.5
+    assert not colourful[(instance > 0) & ~np.isin(instance, trucks)].any()
+    by_words = export_views(street, tmp_path / "words", query="trucks", width=256, height=144)
+    assert by_words.view["query"] == bundle.view["query"]
+    assert export_views(street, tmp_path / "none", width=64, height=64).view["query"] is None
+
+
+def test_provenance_says_synthetic(view):
+    assert view["provenance"]["synthetic"] is True
+    assert view["provenance"]["encoder"] == "boxes"
+    assert view["schema"] == "openvocab_occ.view_bundle"
+    assert view["version"] == 1
+
+
+def test_a_given_camera_is_used_as_it_is(street, tmp_path):
+    camera = CAMERAS["along the street"]
+    view = export_views(street, tmp_path / "given", viewpoint=camera).view
+    assert (view["camera"]["width"], view["camera"]["height"]) == (97, 61)
+    np.testing.assert_allclose(view["camera"]["T_world_cam"], camera.T_world_cam, atol=1e-6)
+    T = np.array(view["ego"]["T_world_ego"])
+    np.testing.assert_allclose(T[:3, 3], camera.position, atol=1e-6)
+    np.testing.assert_allclose(T[2, :3], [0, 0, 1], atol=1e-6)  # level
+    down = export_views(street, tmp_path / "down", viewpoint=CAMERAS["straight down"]).view
+    np.testing.assert_allclose(np.linalg.det(np.array(down["ego"]["T_world_ego"])[:3, :3]), 1.0)
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.0, 2.5])
+def test_an_overview_has_everything_in_it(street, turn):
+    T = pose((0, 0, 0), (np.cos(turn / 2), 0, 0, np.sin(turn / 2)))
+    frames = tuple(dataclasses.replace(f, T_world_ego=T @ f.T_world_ego, cameras=()) for f in street.frames)
+    camera = overview_camera(dataclasses.replace(street, frames=frames), 160, 90)
+    pixels, depth = camera.project(street.voxels.centers)
+    inside = (depth > 0) & camera.inside(pixels)
+    assert inside.mean() > 0.97
+    assert np.ptp(pixels[inside], axis=0).max() > 60  # and it is not far away either
+
+
+def test_a_map_without_cameras_is_seen_from_above(street, tmp_path):
+    bundle = export_views(dataclasses.replace(street, frames=()), tmp_path / "above", width=160, height=90)
+    assert bundle.view["camera"]["name"] == "overview"
+    assert bundle.view["coverage"] > 0.1
+    assert {item["label"] for item in bundle.view["objects"]} >= {"road", "building", "truck", "car"}
+
+
+def test_dense_maps_are_named_by_their_occupancy(street):
+    labels = np.arange(len(street.voxels)) % 4
+    labels[labels == 3] = 255
+    voxels = VoxelMap.from_columns(
+        0.4, street.voxels.keys, np.ones((len(labels), 2), np.float32) / np.sqrt(2).astype(np.float32),
+        {**street.voxels.columns(), "labels": labels.astype(np.uint8)}, contract="dense",
+    )  # fmt: skip
+    encoder = dataclasses.replace(street.encoder, contract="dense", labels=(), dim=2)
+    dense = dataclasses.replace(street, voxels=voxels, encoder=encoder, class_names=("a", "b"))
+    semantics = name_voxels(dense)
+    assert semantics.names == ("a", "b")
+    assert semantics.labels.tolist() == [i % 4 if i % 4 < 2 else -1 for i in range(len(labels))]
+
+
+def test_a_foreign_folder_is_left_alone_and_our_own_replaced(street, tmp_path):
+    foreign = tmp_path / "precious"
+    foreign.mkdir()
+    (foreign / "thesis.tex").write_text("years of work")
+    with pytest.raises(AlreadyExistsError, match=r"not ours to replace: expected a folder with view\.json"):
+        export_views(street, foreign, width=32, height=32)
+    assert [p.name for p in foreign.iterdir()] == ["thesis.tex"]
+    ours = tmp_path / "ours"
+    first = export_views(street, ours, width=32, height=32)
+    (ours / "stale.png").write_bytes(b"")
+    second = export_views(street, ours, width=32, height=32)
+    assert {p.name for p in ours.iterdir()} == set(second.paths)
+    assert first.view == second.view
+
+
+def test_a_failed_export_leaves_nothing(street, tmp_path, monkeypatch):
+    def full(path, image):
+        if path.name == "depth.png":
+            raise OSError("no space left on device")
+
+    monkeypatch.setattr(views, "write_image", full)
+    with pytest.raises(OSError, match="no space"):
+        export_views(street, tmp_path / "out", width=32, height=32)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_same_map_gives_the_same_bytes(street, bundle, tmp_path):
+    again = export_views(street, tmp_path / "again", width=512, height=288)
+    for name, path in again.paths.items():
+        assert path.read_bytes() == bundle.paths[name].read_bytes()
+
+
+@pytest.mark.parametrize("max_depth", [0.0, -1.0, 300.0, float("nan")])
+def test_a_depth_that_does_not_fit_16_bits_is_refused(street, tmp_path, max_depth):
+    with pytest.raises(ConfigError, match="max_depth does not fit a depth image: expected 0 to 256 m"):
+        export_views(street, tmp_path / "out", max_depth=max_depth)
+
+
+def test_an_empty_map_and_tiny_pictures_are_refused(street, tmp_path):
+    tree = ObjectTree([dataclasses.replace(street.objects.root, children=())])
+    empty = dataclasses.replace(street, voxels=VoxelMap(0.4, 7, contract="logits"), objects=tree)
+    with pytest.raises(MapError, match="no voxels to render"):
+        export_views(empty, tmp_path / "out")
+    with pytest.raises(ConfigError, match="at least 16 x 16 pixels, got 8 x 90"):
+        export_views(street, tmp_path / "out", width=8, height=90)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_camera_that_looks_away_sees_nothing(street, tmp_path):
+    away = pinhole(32, 32, 1.0, look_at((0, 0, 50), (0, 0, 100)))
+    bundle = export_views(street, tmp_path / "away", viewpoint=away)
+    assert bundle.view["objects"] == []
+    assert bundle.view["coverage"] == 0
+    assert cv2.imread(str(bundle.paths["semantic.png"])).max() == 0
