@@ -81,7 +81,8 @@ def test_words_are_read_as_labels_or_reported(text, labels, unknown):
 
 @pytest.mark.parametrize(
     ("label", "plural"),
-    [("truck", "trucks"), ("bus", "buses"), ("person", "people"), ("dining table", "dining tables"), ("bench", "benches"),
+    [("truck", "trucks"), ("bus", "buses"), ("person", "people"), ("dining table", "dining tables"),
+     ("bench", "benches"),
      ("mouse", "mice"), ("sheep", "sheep"), ("leaf", "leaves"), ("glass", "glasses"), ("tv/monitor", "tv/monitors"),
      ("lorry", "lorries"), ("traffic cone", "traffic cones"), ("building", "buildings"), ("people", "people")],
 )  # fmt: skip
