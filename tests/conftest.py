@@ -5,9 +5,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 if TYPE_CHECKING:
     from openvocab_occ.objects import SceneMap
+
+# same examples every time, and no deadline: a busy machine is no failure
+settings.register_profile("project", deadline=None, derandomize=True)
+settings.load_profile("project")
 
 DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
 

@@ -100,7 +100,7 @@ class Street:
         columns[..., 0] += ax
         columns[..., 1] += ay
         where = WORLD.index(transform(T_world_ego, columns))  # x y 2 2 3
-        inside: np.ndarray = WORLD.contains(where).all(axis=(2, 3))
+        inside = np.asarray(WORLD.contains(where)).all(axis=(2, 3))
         at = np.clip(where, 0, np.asarray(WORLD.shape) - 1)
         samples = world.labels[at[..., 0], at[..., 1], : 2 * WINDOW.shape[2]]  # x y 2 2 2z: z lattices coincide
         samples = samples.reshape(*WINDOW.shape[:2], 4, WINDOW.shape[2], 2)
@@ -112,7 +112,7 @@ class Street:
                 votes = (samples == label).sum(axis=0, dtype=np.uint8)
                 better = votes > most
                 labels[better], most[better] = label, votes[better]
-        known = np.broadcast_to(inside[:, :, None], WINDOW.shape)
+        known = np.broadcast_to(np.asarray(inside)[:, :, None], WINDOW.shape)
         return OccupancyGrid(labels, WINDOW, T_world_ego, known=known)
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float32, UInt8
 from openvocab_occ.errors import ModelError
 from openvocab_occ.io.files import PathLike, existing, sha256
 from openvocab_occ.segmentation.card import Card, InputCard, find_card, read_card
-from openvocab_occ.segmentation.encoder import Contract, FeatureMap, PixelEncoder
+from openvocab_occ.segmentation.encoder import Contract, FeatureMap, PixelEncoder, TextEncoder
 from openvocab_occ.segmentation.session import Port, Session
 from openvocab_occ.segmentation.text import OnnxTextEncoder
 
@@ -62,7 +62,7 @@ class OnnxEncoder:
         self.name = card.name
         self.contract: Contract = card.contract
         self.labels = card.labels
-        self.text = text
+        self.text: TextEncoder | None = text
         self.dim = len(card.labels) if text is None else text.dim
         self._session = session
         self._input = session.input(card.input.name)
@@ -70,7 +70,7 @@ class OnnxEncoder:
         self._check_declared()
         self.fingerprint = _fingerprint(card, (*session.files, *(text.files if text is not None else ())))
 
-    def encode(self, images: Sequence[UInt8[np.ndarray, "h w 3"]]) -> list[FeatureMap]:
+    def encode(self, images: Sequence[UInt8[np.ndarray, "_ _ 3"]]) -> list[FeatureMap]:
         """Run the model on RGB images of any sizes."""
         batch = self._input.shape[0] or _BATCH
         maps: list[FeatureMap] = []

@@ -189,7 +189,9 @@ def _open(path: Path, providers: Sequence[str], threads: int | None) -> "onnxrun
 
 
 def _runtime_errors() -> tuple[type[Exception], ...]:
-    from onnxruntime.capi import onnxruntime_pybind11_state as state  # pyright: ignore[reportAttributeAccessIssue]
+    from importlib import import_module
+
+    state = import_module("onnxruntime.capi.onnxruntime_pybind11_state")
 
     kinds = [k for k in vars(state).values() if isinstance(k, type) and issubclass(k, Exception)]
     return (*kinds, RuntimeError, ValueError)

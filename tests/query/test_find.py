@@ -79,21 +79,20 @@ def test_words_are_read_as_labels_or_reported(text, labels, unknown):
     assert match.unknown == unknown
 
 
-@pytest.mark.parametrize("label", [*LABELS, "diningtable", "grass", "glass", "mice", "sheep", "tv/monitor", "people"])
-def test_every_label_and_its_plural_name_it(label):
-    import inflect
-
-    for text in (label, inflect.engine().plural_noun(label), label.upper(), f"the {label}!"):
+@pytest.mark.parametrize(
+    ("label", "plural"),
+    [("truck", "trucks"), ("bus", "buses"), ("person", "people"), ("dining table", "dining tables"),
+     ("bench", "benches"),
+     ("mouse", "mice"), ("sheep", "sheep"), ("leaf", "leaves"), ("glass", "glasses"), ("tv/monitor", "tv/monitors"),
+     ("lorry", "lorries"), ("traffic cone", "traffic cones"), ("building", "buildings"), ("people", "people")],
+)  # fmt: skip
+def test_every_label_and_its_plural_name_it(label, plural):
+    for text in (label, plural, label.upper(), f"the {plural}!"):
         assert match_labels(text, ["x", label, "y"]).channels.tolist() == [False, True, False], text
 
 
 def test_the_longest_label_wins_also_inflected():
     assert match_labels("traffic cones", ["traffic", "traffic cone"]).channels.tolist() == [False, True]
-
-
-def test_plain_labels_need_no_inflection(monkeypatch):
-    monkeypatch.setattr("openvocab_occ.query.words.singular", None)
-    assert match_labels("the Traffic-cone or road", LABELS).channels.sum() == 2
 
 
 def test_compound_labels_are_found_written_apart():
