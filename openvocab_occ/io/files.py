@@ -1,5 +1,6 @@
 """Files: friendly errors when missing, outputs that are whole or not there at all."""
 
+import difflib
 import hashlib
 import os
 import shutil
@@ -21,11 +22,12 @@ def existing(path: PathLike, what: str) -> Path:
     parent = found.parent
     if not parent.is_dir():
         raise NotFoundError(f"{what} not found", expected=str(found), got=f"no folder {parent}", fix="check the path")
-    near = sorted(p.name for p in parent.iterdir())[:8]
+    names = sorted(p.name for p in parent.iterdir())
+    near = difflib.get_close_matches(found.name, names, n=3) or names[:3]
     raise NotFoundError(
         f"{what} not found",
         expected=str(found),
-        got=f"only {', '.join(near) or 'nothing'} in {parent}",
+        got=f"{len(names)} others there, such as {', '.join(near)}" if names else "an empty folder",
         fix="check the path",
     )
 
