@@ -9,7 +9,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
-from openvocab_occ.errors import AlreadyExistsError, NotFoundError
+from openvocab_occ.errors import AlreadyExistsError, ConfigError, NotFoundError
 
 PathLike = str | os.PathLike[str]
 
@@ -47,9 +47,8 @@ def fsync(path: Path) -> None:
         os.close(descriptor)
 
 
-@contextmanager
-def written_folder(path: PathLike, *, marker: str) -> Generator[Path, None, None]:
-    """Yield a temporary sibling of `path` to write into; on success it takes the place of `path`, else it is removed.
+def output_folder(path: PathLike, *, marker: str) -> Path:
+    """Return a path that `written_folder` may write, its parent made, or raise; worth asking before long work.
 
     An existing folder is replaced only if it holds a file called `marker`, so that no other folder is ever lost.
     """
@@ -60,7 +59,23 @@ def written_folder(path: PathLike, *, marker: str) -> Generator[Path, None, None
             expected=f"a folder with {marker}, or none",
             fix="choose another output path",
         )
-    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=target.parent).close()
+    except OSError as error:
+        raise ConfigError(
+            f"{target} cannot be written", got=error.strerror, fix="choose another output path"
+        ) from error
+    return target
+
+
+@contextmanager
+def written_folder(path: PathLike, *, marker: str) -> Generator[Path, None, None]:
+    """Yield a temporary sibling of `path` to write into; on success it takes the place of `path`, else it is removed.
+
+    What may be replaced is told by `output_folder`.
+    """
+    target = output_folder(path, marker=marker)
     scratch = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
     try:
         scratch.chmod(0o755)

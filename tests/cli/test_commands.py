@@ -120,6 +120,11 @@ class TestBadInput:
         assert "not ours" in message
         assert (tmp_path / "a.ovmap" / "holiday.jpg").read_bytes() == b"x"
 
+    def test_output_that_cannot_be_written_is_said_before_the_work(self, tmp_path, capsys):
+        (tmp_path / "file").touch()
+        message = refused(capsys, "map", "city", "any", "--encoder", "no.onnx", "--out", tmp_path / "file" / "a.ovmap")
+        assert "cannot be written" in message
+
     @pytest.mark.data
     def test_model_against_its_card(self, data, tmp_path, capsys):
         model = data / "onnx" / "deeplabv3" / "deeplab_v3_voc.onnx"
