@@ -1,0 +1,175 @@
+"""Tracks: segments of many frames that are one thing."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from openvocab_occ.mapping.keys import pack, unpack
+from openvocab_occ.objects.kinds import Kind, kinds_of
+from openvocab_occ.objects.segments import Crop, Segment
+from openvocab_occ.objects.state import Motion, StateConfig, observe_motion, shift
+
+BEST_CROPS = 5
+_HISTORY = 64  # sightings kept for motion; every other one goes when there are more
+
+
+@dataclass(eq=False)
+class Track:
+    """One thing, and what was seen of it. Mutable: grows by `add` and `absorb`."""
+
+    id: int
+    voxel_size: float
+    feature_sum: Float32[np.ndarray, " c"]
+    class_votes: Float32[np.ndarray, " k"]
+    weight: float = 0.0
+    agreement_sum: float = 0.0
+    """Frame features' lengths along the mean, by weight: how far the frames agree."""
+    frames: list[int] = field(default_factory=list[int])
+    times: list[float] = field(default_factory=list[float])
+    """Of each sighting."""
+    bound_times: list[float] = field(default_factory=list[float])
+    bounds: list[Float64[np.ndarray, " 4"]] = field(default_factory=list[np.ndarray])
+    """Low x, low y, high x, high y of sightings that show where the thing ends."""
+    crops: list[Crop] = field(default_factory=list[Crop])
+    cells: set[int] = field(default_factory=set[int])
+    """Coarse cells of its body, as the tracker's index holds them."""
+    last: Segment | None = None
+    last_time: float = -np.inf
+    previous: tuple[float, Float64[np.ndarray, " 2"], Float64[np.ndarray, " 2"]] | None = None
+    velocity: Float64[np.ndarray, " 2"] = field(default_factory=lambda: np.zeros(2))
+    """Of the motion model, metres a second."""
+    moved: bool = False
+    """True once it moved further than sightings err; its older voxels are then a trail, not the thing."""
+    _pieces: list[Int64[np.ndarray, " n"]] = field(default_factory=list[np.ndarray])
+    _compacted: int = 0
+
+    @classmethod
+    def born(cls, id: int, segment: Segment, frame: int, time: float, voxel_size: float) -> "Track":
+        """Begin with one segment."""
+        track = cls(id, voxel_size, np.zeros_like(segment.feature_sum), np.zeros_like(segment.class_votes))
+        track.add(segment, frame, time)
+        return track
+
+    def add(self, segment: Segment, frame: int, time: float) -> None:
+        """Add the segment of another frame."""
+        self._add_evidence(segment)
+        if not segment.cut_off:
+            self._measure(segment, time)
+        self.frames.append(frame)
+        self.times.append(time)
+        if self.moved:
+            self._pieces, self._compacted = [], 0
+        self._pieces.append(segment.seen)
+        self._compact()
+        self.last, self.last_time = segment, time
+
+    def absorb(self, other: "Track") -> None:
+        """Become what both are."""
+        self.feature_sum = self.feature_sum + other.feature_sum
+        self.class_votes = self.class_votes + other.class_votes
+        self.weight += other.weight
+        self.agreement_sum += other.agreement_sum
+        order = np.argsort(self.times + other.times, kind="stable")
+        frames, times = self.frames + other.frames, self.times + other.times
+        merged = {frames[i]: times[i] for i in order}
+        self.frames, self.times = list(merged), list(merged.values())
+        bounds: dict[float, np.ndarray] = {}
+        for time, bound in zip(self.bound_times + other.bound_times, self.bounds + other.bounds, strict=True):
+            both = bounds.get(time)
+            bounds[time] = bound if both is None else np.r_[np.minimum(both[:2], bound[:2]),
+                                                            np.maximum(both[2:], bound[2:])]  # fmt: skip
+        self.bound_times = sorted(bounds)
+        self.bounds = [bounds[time] for time in self.bound_times]
+        self._keep_crops(other.crops)
+        self.cells |= other.cells
+        self.moved = self.moved or other.moved
+        if other.last is not None and (self.last is None or other.last_time > self.last_time):
+            self.last, self.last_time = other.last, other.last_time
+            self.velocity = other.velocity
+        self._pieces = [self.last.seen] if self.moved and self.last is not None else self._pieces + other._pieces
+        self._compacted = 0
+
+    @property
+    def voxels(self) -> Int64[np.ndarray, " n"]:
+        """Packed keys of its voxels: all that were seen of a thing that stands, the latest of one that moves."""
+        self._compact(force=True)
+        return self._pieces[0]
+
+    @property
+    def feature(self) -> Float32[np.ndarray, " c"]:
+        """Mean feature as a unit vector."""
+        return (self.feature_sum / max(float(np.linalg.norm(self.feature_sum)), 1e-12)).astype(np.float32)
+
+    def movable(self, names: Sequence[str]) -> float:
+        """Return the share of class evidence that speaks for a thing that can move; NaN where there is none."""
+        kinds = kinds_of(names)[: len(self.class_votes)]
+        known = float(self.class_votes[kinds != Kind.UNKNOWN].sum())
+        return float(self.class_votes[kinds == Kind.MOVABLE].sum()) / known if known > 0 else float("nan")
+
+    def motion(self, config: StateConfig | None = None) -> Motion:
+        """Sum up what was seen of its motion."""
+        bounds = np.array(self.bounds, dtype=np.float64).reshape(-1, 4)
+        return observe_motion(
+            np.array(self.bound_times, dtype=np.float64), bounds[:, :2], bounds[:, 2:], sightings=len(self.frames),
+            time_observed=self.times[-1] - self.times[0], voxel_size=self.voxel_size, config=config,
+        )  # fmt: skip
+
+    def predicted(self, time: float) -> Float64[np.ndarray, " 2"]:
+        """Return how far it went since it was last seen if it kept its velocity, metres along x and y."""
+        return self.velocity * (time - self.last_time)
+
+    def _add_evidence(self, segment: Segment) -> None:
+        self.feature_sum = self.feature_sum + segment.feature_sum
+        self.class_votes = self.class_votes + segment.class_votes
+        self.weight += segment.weight
+        self._keep_crops(segment.crops)
+
+    def _measure(self, segment: Segment, time: float) -> None:
+        low, high = segment.low[:2], segment.high[:2]
+        if self.previous is not None and time > self.previous[0]:
+            before, low0, high0 = self.previous
+            measured = shift(low0, high0, low, high) / (time - before)
+            fresh = 1.0 if len(self.bounds) < 2 else 0.6  # a steady-state alpha-beta filter of constant velocity
+            self.velocity = self.velocity + fresh * (measured - self.velocity)
+        self.previous = (time, low, high)
+        self.bound_times.append(time)
+        self.bounds.append(np.r_[low, high])
+        if len(self.bounds) > _HISTORY:
+            self.bounds, self.bound_times = self.bounds[::2], self.bound_times[::2]
+        first = self.bounds[0]
+        way = shift(first[:2], first[2:], low, high)
+        self.moved = self.moved or float(np.linalg.norm(way)) > max(1.0, 2.0 * self.voxel_size)
+
+    def _keep_crops(self, crops: Iterable[Crop]) -> None:
+        ranked = sorted([*self.crops, *crops], key=lambda c: (-c.score, c.frame, c.view))
+        self.crops = ranked[:BEST_CROPS]
+
+    def _compact(self, *, force: bool = False) -> None:
+        """Unite the pieces once they are twice what they were, so that a long look costs little each frame."""
+        size = sum(map(len, self._pieces))
+        if len(self._pieces) > 1 and (force or size > 2 * self._compacted + 64):
+            self._pieces = [np.unique(np.concatenate(self._pieces))]
+            self._compacted = len(self._pieces[0])
+
+
+def joined(a: Segment, b: Segment) -> Segment:
+    """Return two pieces of one frame as one segment."""
+    return Segment(
+        seen=np.union1d(a.seen, b.seen),
+        body=np.union1d(a.body, b.body),
+        feature_sum=a.feature_sum + b.feature_sum,
+        weight=a.weight + b.weight,
+        class_votes=a.class_votes + b.class_votes,
+        low=np.minimum(a.low, b.low),
+        high=np.maximum(a.high, b.high),
+        cut_off=a.cut_off or b.cut_off,
+        crops=a.crops + b.crops,
+    )
+
+
+def coarse(packed: Int64[np.ndarray, " n"], shift_vox: tuple[int, int] = (0, 0)) -> Int64[np.ndarray, " m"]:
+    """Return the cells, two voxels a side, that packed keys lie in after a shift along x and y in voxels."""
+    keys = unpack(packed) + np.array([*shift_vox, 0], dtype=np.int32)
+    return np.unique(pack(keys >> 1))
