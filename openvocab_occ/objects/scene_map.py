@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from openvocab_occ.geometry import Camera, as_pose
 from openvocab_occ.io.files import PathLike
-from openvocab_occ.mapping import VoxelMap
+from openvocab_occ.mapping import DynamicLayer, VoxelMap
 from openvocab_occ.objects.tree import ObjectTree
 from openvocab_occ.segmentation.encoder import Contract, PixelEncoder
 
@@ -97,6 +97,8 @@ class SceneMap:
     provenance: Provenance = field(default_factory=Provenance)
     class_names: tuple[str, ...] = ()
     """Names of the occupancy classes in `voxels.labels`."""
+    dynamic: tuple[DynamicLayer, ...] = ()
+    """What moved, frame by frame; none of it is in `voxels`."""
 
     def save(self, path: PathLike) -> Path:
         """Write a `.ovmap` folder, whole or not at all; an older map at `path` is replaced, any other folder is not."""
