@@ -16,7 +16,7 @@ MOVABLE = (
     "bicycle", "bus", "car", "construction vehicle", "motorcycle", "pedestrian", "trailer", "truck",
 )  # fmt: skip
 """Classes of Occ3D, and of grids that use its names, whose voxels may be elsewhere in the next frame."""
-MIN_LEFT = 0.25
+MIN_LEFT = 0.5
 """Share of a thing's voxels that must be seen through at another time before it counts as moving. The rim of a thing
 that stands jitters with the lattice and the pose; one that moves by half its length leaves half of its voxels."""
 _FORWARD = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)])[14:]
