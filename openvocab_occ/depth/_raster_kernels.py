@@ -15,20 +15,26 @@ import numpy as np
 
 from openvocab_occ._jit import kernel
 
-# Pixels by which a face reaches over its outline, so that rounding leaves no cracks between neighbours.
-_OVERLAP = 1e-6
+# Pixels around an outline in which a pixel counts as covered, so that no cracks are left between neighbours, and as in
+# doubt: far above the rounding of corners, whose part grows with how far off the image they are.
+_BAND, _ROUNDING = 1e-6, 1e-11
+# Float32 keeps what lies a little beyond the end; `resolve` cuts there.
+_BEYOND = 1.0 + 1e-6
 
 
 @kernel
 @no_type_check
-def raster(faces, M, P, o, near, max_depth, row0, inverse, winner):
+def raster(faces, M, P, o, near, max_depth, row0, doubt, inverse, winner):
     """Keep for each pixel of the rows from row0 on the nearest face: 1 / depth in `inverse`, its number in `winner`.
 
-    P projects (x, y, z) relative to the camera, in voxels, to homogeneous pixels whose third number is z-depth. Faces must
-    not come nearer than the z-depth `near`.
+    P projects (x, y, z) relative to the camera, in voxels, to homogeneous pixels whose third number is z-depth. Faces
+    must not come nearer than the z-depth `near`. Pixels on the outline of a face go to `doubt`, as flat indices of
+    these rows, some of them often; returns how many they are, also beyond the end of `doubt`.
     """
     height, width = inverse.shape
-    inverse[:] = np.float32(1.0 / max_depth)
+    doubts = 0
+    far = max_depth * _BEYOND
+    inverse[:] = np.float32(1.0 / far)
     winner[:] = -1
     corner = np.empty((4, 3))
     clipped = np.empty((8, 3))
@@ -61,7 +67,7 @@ def raster(faces, M, P, o, near, max_depth, row0, inverse, winner):
         for k in range(4):
             low = min(low, corner[k, 2])
             high = max(high, corner[k, 2])
-        if high < near or low >= max_depth:
+        if high < near or low > far:
             continue
         m = 4
         if low < near:  # cut at the near plane (Sutherland-Hodgman, one plane)
@@ -98,9 +104,12 @@ def raster(faces, M, P, o, near, max_depth, row0, inverse, winner):
             right = max(right, px[k])
             top = min(top, py[k])
             bottom = max(bottom, py[k])
-        y0 = max(row0, math.ceil(max(top, -1.0) - _OVERLAP))
-        y1 = min(row0 + height - 1, math.floor(min(bottom, 1e8) + _OVERLAP))
-        if y0 > y1 or right < -_OVERLAP or left > width - 1 + _OVERLAP or math.ceil(left - _OVERLAP) > right + _OVERLAP:
+        band = _BAND + _ROUNDING * max(max(-left, right), max(-top, bottom))
+        if right < -band or left > width - 1 + band or bottom < row0 - band or top > row0 + height - 1 + band:
+            continue
+        y0 = max(row0, math.ceil(max(top, -1.0) - band))
+        y1 = min(row0 + height - 1, math.floor(min(bottom, row0 + height + 1.0) + band))
+        if y0 > y1 or math.ceil(max(left, -1.0) - band) > right + band:
             continue
         A = M[axis, 0] / h
         B = M[axis, 1] / h
@@ -110,26 +119,41 @@ def raster(faces, M, P, o, near, max_depth, row0, inverse, winner):
         for y in range(y0, y1 + 1):
             low = math.inf
             high = -math.inf
+            slack = 0.0
             for k in range(m):
                 k2 = k + 1 if k + 1 < m else 0
                 ya = py[k]
                 yb = py[k2]
                 if ya > yb:
                     ya, yb = yb, ya
-                if ya - _OVERLAP <= y <= yb + _OVERLAP:
-                    if yb - ya <= 2 * _OVERLAP:  # level with the scan line
+                if ya - band <= y <= yb + band:
+                    if yb - ya <= 4.0 * band:  # level with the scan line: all of it is outline
                         low = min(low, px[k], px[k2])
                         high = max(high, px[k], px[k2])
+                        slack = math.inf
                     else:
-                        s = (y - py[k]) / (py[k2] - py[k])
-                        s = min(1.0, max(0.0, s))
-                        x = px[k] + s * (px[k2] - px[k])
+                        lean = (px[k2] - px[k]) / (py[k2] - py[k])
+                        x = px[k] + (min(max(y, ya), yb) - py[k]) * lean
                         low = min(low, x)
                         high = max(high, x)
-            x0 = math.ceil(max(low, 0.0) - _OVERLAP)
-            x1 = math.floor(min(high, width - 1.0) + _OVERLAP)
+                        slack = max(slack, band * (1.0 + abs(lean)))
+            reach = slack if slack < math.inf else band
+            x0 = math.ceil(max(low - reach, 0.0))
+            x1 = math.floor(min(high + reach, width - 1.0))
             if x0 > x1:
                 continue
+            x = x0
+            while x <= x1 and x <= low + slack:
+                if doubts < doubt.shape[0]:
+                    doubt[doubts] = (y - row0) * width + x
+                doubts += 1
+                x += 1
+            end = x1
+            while end >= x and end >= high - slack:
+                if doubts < doubt.shape[0]:
+                    doubt[doubts] = (y - row0) * width + end
+                doubts += 1
+                end -= 1
             start = np.float32(A * x0 + B * y + C)
             row = inverse[y - row0, x0 : x1 + 1]
             ids = winner[y - row0, x0 : x1 + 1]
@@ -138,30 +162,37 @@ def raster(faces, M, P, o, near, max_depth, row0, inverse, winner):
                 nearer = value > row[x]
                 row[x] = value if nearer else row[x]
                 ids[x] = number if nearer else ids[x]
+    return doubts
 
 
 @kernel
 @no_type_check
-def resolve(faces, M, o, shape, max_depth, row0, inverse, winner):
-    """Turn 1 / depth into depth and the winning face into its voxel's flat index, in place."""
+def resolve(faces, lens, R, o, shape, max_depth, row0, inverse, winner):
+    """Turn 1 / depth into depth and the winning face into its voxel's flat index, in place.
+
+    The depth is taken anew from the face's plane, in float64, by the formula of `PixelRays`.
+    """
     height, width = inverse.shape
     Y = shape[1]
     Z = shape[2]
     far = np.float32(max_depth)
-    one = np.float32(1.0)
-    for y in range(height):
-        row = inverse[y]
-        ids = winner[y]
-        x = 0
-        while x < width:
-            f = ids[x]
-            end = x + 1
+    xs = np.empty(width)
+    for row in range(height):
+        y = (row0 + row - lens[4]) / lens[3]
+        if row == 0 or lens[1] != 0.0:
+            for u in range(width):
+                xs[u] = ((u - lens[2]) - lens[1] * y) / lens[0]
+        depths = inverse[row]
+        ids = winner[row]
+        begin = 0
+        while begin < width:
+            f = ids[begin]
+            end = begin + 1
             while end < width and ids[end] == f:
                 end += 1
             if f < 0:
-                for k in range(x, end):
-                    row[k] = far
-                x = end
+                depths[begin:end] = far
+                begin = end
                 continue
             kind = faces[f, 0]
             axis = kind >> 1
@@ -171,25 +202,33 @@ def resolve(faces, M, o, shape, max_depth, row0, inverse, winner):
             stride_b = np.int32(Z if axis == 2 else 1)
             stride_c = np.int32(Y * Z if axis == 0 else (Z if axis == 1 else 1))
             fixed = np.int32(faces[f, 1] - (kind & 1)) * stride_c
-            # cells are counted from the face's corner: its float32 is exact enough over one face
-            da = np.float32(M[first, 0])
-            db = np.float32(M[second, 0])
-            ra = np.float32(M[first, 0] * x + M[first, 1] * (row0 + y) + M[first, 2])
-            rb = np.float32(M[second, 0] * x + M[second, 1] * (row0 + y) + M[second, 2])
-            oa = np.float32(o[first] - faces[f, 2])
-            ob = np.float32(o[second] - faces[f, 4])
-            na = np.int32(faces[f, 3] - faces[f, 2] - 1)
-            nb = np.int32(faces[f, 5] - faces[f, 4] - 1)
             fixed += np.int32(faces[f, 2]) * stride_a + np.int32(faces[f, 4]) * stride_b
-            zero = np.int32(0)
-            span = row[x:end]
-            out = ids[x:end]
-            for k in range(end - x):
-                d = one / span[k]
-                a = np.int32(oa + d * (ra + da * np.float32(k)))
-                b = np.int32(ob + d * (rb + db * np.float32(k)))
-                a = min(max(a, zero), na)
-                b = min(max(b, zero), nb)
-                span[k] = d
-                out[k] = fixed + a * stride_a + b * stride_b
-            x = end
+            h = faces[f, 1] - o[axis]
+            c0, c1y, c2 = R[axis, 0], R[axis, 1] * y, R[axis, 2]
+            a0, a1y, a2 = R[first, 0], R[first, 1] * y, R[first, 2]
+            b0, b1y, b2 = R[second, 0], R[second, 1] * y, R[second, 2]
+            oa = o[first] - faces[f, 2]
+            ob = o[second] - faces[f, 4]
+            na = np.float64(faces[f, 3] - faces[f, 2] - 1)
+            nb = np.float64(faces[f, 5] - faces[f, 4] - 1)
+            xx = xs[begin:end]
+            span = depths[begin:end]
+            out = ids[begin:end]
+            for k in range(end - begin):
+                x = xx[k]
+                d = h / ((c0 * x + c1y) + c2)
+                va = (a0 * x + a1y) + a2
+                vb = (b0 * x + b1y) + b2
+                a = oa + d * va
+                b = ob + d * vb
+                # a ray that goes down through a cell's lower face as it hits is in the cell below
+                fa = np.floor(a)
+                fb = np.floor(b)
+                fa -= 1.0 if (fa == a) & (va < 0.0) else 0.0
+                fb -= 1.0 if (fb == b) & (vb < 0.0) else 0.0
+                fa = min(max(fa, 0.0), na)
+                fb = min(max(fb, 0.0), nb)
+                hit = d < max_depth
+                span[k] = np.float32(d) if hit else far
+                out[k] = fixed + np.int32(fa) * stride_a + np.int32(fb) * stride_b if hit else np.int32(-1)
+            begin = end

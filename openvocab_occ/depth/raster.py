@@ -1,42 +1,35 @@
 """Exact depth of pinhole cameras by rasterising the faces of a grid: far faster than walking a ray for each pixel."""
 
-from dataclasses import dataclass
-
 import numpy as np
-from jaxtyping import Bool, Float, Int32
+from jaxtyping import Bool, Float, Int, Int32
 
 from openvocab_occ._jit import in_slices, num_threads
 from openvocab_occ.depth import _raster_kernels
 from openvocab_occ.depth.image import DepthImage
-from openvocab_occ.geometry import Camera, GridSpec, invert
+from openvocab_occ.depth.pixel_rays import PixelRays
+from openvocab_occ.geometry import Camera
+from openvocab_occ.occupancy import OccupancyGrid
+from openvocab_occ.occupancy._rays_kernels import first_hits
 
-# A camera nearer than this to an occupied voxel, in voxels, is left to the ray walk: its faces fill the view edge-on.
-MIN_CLEARANCE = 1e-3
+MIN_CLEARANCE = 0.02
+"""Voxels from the camera to the nearest occupied one. Nearer, or inside, faces fill the view edge-on."""
+# Where float64 no longer keeps projected corners within a small part of a pixel: voxels to the camera, pixels of focal
+# length, length of a ray a depth of 1 (89.9 degrees off the axis).
+_MAX_DISTANCE, _MAX_FOCAL, _MAX_SLANT = 1e5, 1e5, 600.0
+_DOUBTS = 16  # one pixel in this many may be in doubt before a band of rows is walked as a whole
 
 
-@dataclass(frozen=True)
-class PixelRays:
-    """A pinhole camera in the lattice of a grid: lengths are voxels, per axis, and depth stays z-depth in metres."""
-
-    M: Float[np.ndarray, "3 3"]
-    """Pixel (u, v, 1) to the ray's motion a metre of z-depth."""
-    P: Float[np.ndarray, "3 3"]
-    """Offset from the camera to homogeneous pixel times z-depth; the inverse of M."""
-    origin: Float[np.ndarray, " 3"]
-    """The camera."""
-    stretch: float
-    """Longest ray a metre of z-depth, over the pixels, in voxels."""
-
-    @classmethod
-    def of(cls, camera: Camera, spec: GridSpec, T_world_grid: Float[np.ndarray, "4 4"]) -> "PixelRays":
-        """Express the camera in the lattice."""
-        T_grid_cam = invert(T_world_grid) @ camera.T_world_cam
-        M = T_grid_cam[:3, :3] @ np.linalg.inv(camera.K) / spec.size[:, None]
-        P = camera.K @ T_grid_cam[:3, :3].T * spec.size
-        origin = (T_grid_cam[:3, 3] - spec.origin) / spec.size
-        # the length of an affine function is convex: greatest at a corner of the image
-        corners = np.array([[u, v, 1.0] for u in (0, camera.width - 1) for v in (0, camera.height - 1)])
-        return cls(M, P, origin, float(np.linalg.norm(corners @ M.T, axis=1).max()))
+def can_raster(camera: Camera, rays: PixelRays, occupied: Bool[np.ndarray, "x y z"]) -> bool:
+    """Tell whether the rasteriser is exact for this camera; else its rays have to be walked."""
+    fx, _, _, fy, _ = rays.lens
+    slant = rays.longest / float(np.linalg.norm(rays.R, axis=0).min())
+    return (
+        camera.lens == "pinhole"
+        and max(fx, fy) < _MAX_FOCAL
+        and slant < _MAX_SLANT
+        and float(np.abs(rays.origin).max()) < _MAX_DISTANCE
+        and clearance(occupied, rays.origin) >= MIN_CLEARANCE
+    )
 
 
 def clearance(occupied: Bool[np.ndarray, "x y z"], origin: Float[np.ndarray, " 3"]) -> float:
@@ -52,26 +45,54 @@ def clearance(occupied: Bool[np.ndarray, "x y z"], origin: Float[np.ndarray, " 3
 
 
 def raster(
-    faces: Int32[np.ndarray, "n 6"], shape: tuple[int, int, int], views: list[tuple[Camera, PixelRays, float]], max_depth: float
-) -> list[DepthImage]:
-    """Render cameras, each with its clearance, of at least MIN_CLEARANCE.
+    grid: OccupancyGrid, views: list[PixelRays], max_depth: float
+) -> list[tuple[DepthImage, Int[np.ndarray, " pixels"]]]:
+    """Render cameras for which `can_raster`; with each image the pixels that were in doubt.
 
-    A picture is cut into bands of rows so that one camera, too, keeps all threads busy; the result does not depend on it.
+    In doubt is a pixel whose ray comes within about a millionth of a pixel of the outline of a face, where rounding, or
+    the rule for rays that touch an edge, decides. Those rays are walked, so that the image is the walk's throughout.
+    A picture is cut into bands of rows so that one camera, too, keeps all threads busy; the result does not depend on
+    it.
     """
-    images = [
-        DepthImage(np.empty((c.height, c.width), np.float32), np.empty((c.height, c.width), np.int32)) for c, _, _ in views
-    ]
+    if not views:
+        return []
+    faces, occupied = grid.faces, grid.occupied
+    images = [DepthImage(np.empty(v.size, np.float32), np.empty(v.size, np.int32)) for v in views]
     bands = -(-2 * num_threads() // len(views)) if num_threads() > 1 else 1
-    extent = np.array(shape)
+    doubts: list[Int[np.ndarray, " pixels"]] = [np.empty(0, np.int64)] * (len(views) * bands)
 
     def work(start: int, stop: int) -> None:
         for job in range(start, stop):
-            (camera, rays, gap), image = views[job // bands], images[job // bands]
-            top, bottom = (camera.height * (job % bands + k) // bands for k in (0, 1))
-            depth, voxel = image.depth[top:bottom], image.voxel[top:bottom]
-            near = 0.999 * gap / rays.stretch
-            _raster_kernels.raster(faces, rays.M, rays.P, rays.origin, near, max_depth, top, depth, voxel)
-            _raster_kernels.resolve(faces, rays.M, rays.origin, extent, max_depth, top, depth, voxel)
+            rays, image = views[job // bands], images[job // bands]
+            top, bottom = (rays.size[0] * (job % bands + k) // bands for k in (0, 1))
+            doubts[job] = _band(faces, occupied, rays, max_depth, image, top, bottom)
 
     in_slices(work, len(views) * bands)
-    return images
+    return [(image, np.concatenate(doubts[k * bands : (k + 1) * bands])) for k, image in enumerate(images)]
+
+
+def _band(
+    faces: Int32[np.ndarray, "n 6"],
+    occupied: Bool[np.ndarray, "x y z"],
+    rays: PixelRays,
+    max_depth: float,
+    image: DepthImage,
+    top: int,
+    bottom: int,
+) -> Int[np.ndarray, " pixels"]:
+    """Render rows top..bottom, and return the flat indices of the pixels that had to be walked."""
+    width = rays.size[1]
+    depth, voxel = image.depth[top:bottom], image.voxel[top:bottom]
+    M, near = rays.M, 0.999 * clearance(occupied, rays.origin) / rays.longest
+    doubt = np.empty(depth.size // _DOUBTS + 64, np.int32)
+    found = _raster_kernels.raster(faces, M, np.linalg.inv(M), rays.origin, near, max_depth, top, doubt, depth, voxel)
+    if found > len(doubt):
+        pixels = np.arange(top * width, bottom * width)
+    else:
+        _raster_kernels.resolve(faces, rays.lens, rays.R, rays.origin, occupied.shape, max_depth, top, depth, voxel)
+        pixels = np.unique(doubt[:found]).astype(np.int64) + top * width
+    directions = rays.directions(pixels)
+    t, hit = np.empty(len(pixels), np.float32), np.empty(len(pixels), np.int32)
+    first_hits(rays.origin[None], directions, occupied, max_depth, 0, len(pixels), t, hit)
+    image.depth.ravel()[pixels], image.voxel.ravel()[pixels] = t, hit
+    return pixels

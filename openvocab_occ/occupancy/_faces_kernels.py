@@ -1,8 +1,8 @@
 """Merge the exposed faces of occupied voxels into rectangles, on bit columns ("binary greedy meshing").
 
-A plane of exposed faces is a bit image: row a holds up to 64 cells b as the bits of one word. The lowest run of set bits of
-a row is widened over the following rows while they hold it too, written out, and cleared. Axis and side of a rectangle are
-one number, kind = 2 axis + side, side 0 facing down the axis and 1 up.
+A plane of exposed faces is a bit image: row a holds up to 64 cells b as the bits of one word. The lowest run of set
+bits of a row is widened over the following rows while they hold it too, written out, and cleared. Axis and side of a
+rectangle are one number, kind = 2 axis + side, side 0 facing down the axis and 1 up.
 """
 
 from typing import no_type_check
