@@ -20,6 +20,7 @@ from openvocab_occ._jit import kernel
 _BAND, _ROUNDING = 1e-6, 1e-11
 # Float32 keeps what lies a little beyond the end; `resolve` cuts there.
 _BEYOND = 1.0 + 1e-6
+_CELL_EDGE = 1e-9  # voxels from the border of a cell of a face within which rounding says which one is hit
 
 
 @kernel
@@ -167,10 +168,12 @@ def raster(faces, M, P, o, near, max_depth, row0, doubt, inverse, winner):
 
 @kernel
 @no_type_check
-def resolve(faces, lens, R, o, shape, max_depth, row0, inverse, winner):
+def resolve(faces, lens, R, o, shape, max_depth, row0, doubts, doubt, inverse, winner):
     """Turn 1 / depth into depth and the winning face into its voxel's flat index, in place.
 
-    The depth is taken anew from the face's plane, in float64, by the formula of `PixelRays`.
+    The depth is taken anew from the face's plane, in float64, by the formula of `PixelRays`. Pixels on the border
+    between two voxels of a face are appended to `doubt`, which holds `doubts` already; returns how many it then should
+    hold.
     """
     height, width = inverse.shape
     Y = shape[1]
@@ -214,6 +217,7 @@ def resolve(faces, lens, R, o, shape, max_depth, row0, inverse, winner):
             xx = xs[begin:end]
             span = depths[begin:end]
             out = ids[begin:end]
+            tied = False
             for k in range(end - begin):
                 x = xx[k]
                 d = h / ((c0 * x + c1y) + c2)
@@ -221,14 +225,23 @@ def resolve(faces, lens, R, o, shape, max_depth, row0, inverse, winner):
                 vb = (b0 * x + b1y) + b2
                 a = oa + d * va
                 b = ob + d * vb
-                # a ray that goes down through a cell's lower face as it hits is in the cell below
                 fa = np.floor(a)
                 fb = np.floor(b)
-                fa -= 1.0 if (fa == a) & (va < 0.0) else 0.0
-                fb -= 1.0 if (fb == b) & (vb < 0.0) else 0.0
+                tied |= (a - fa < _CELL_EDGE) | (b - fb < _CELL_EDGE)
+                tied |= (a - fa > 1.0 - _CELL_EDGE) | (b - fb > 1.0 - _CELL_EDGE)
                 fa = min(max(fa, 0.0), na)
                 fb = min(max(fb, 0.0), nb)
                 hit = d < max_depth
                 span[k] = np.float32(d) if hit else far
                 out[k] = fixed + np.int32(fa) * stride_a + np.int32(fb) * stride_b if hit else np.int32(-1)
+            if tied:  # somewhere in this run: rare, so find out where in a loop of its own
+                for k in range(end - begin):
+                    d = h / ((c0 * xx[k] + c1y) + c2)
+                    a = oa + d * ((a0 * xx[k] + a1y) + a2)
+                    b = ob + d * ((b0 * xx[k] + b1y) + b2)
+                    if min(abs(a - np.rint(a)), abs(b - np.rint(b))) < 2.0 * _CELL_EDGE:
+                        if doubts < doubt.shape[0]:
+                            doubt[doubts] = row * width + begin + k
+                        doubts += 1
             begin = end
+    return doubts

@@ -49,10 +49,10 @@ def raster(
 ) -> list[tuple[DepthImage, Int[np.ndarray, " pixels"]]]:
     """Render cameras for which `can_raster`; with each image the pixels that were in doubt.
 
-    In doubt is a pixel whose ray comes within about a millionth of a pixel of the outline of a face, where rounding, or
-    the rule for rays that touch an edge, decides. Those rays are walked, so that the image is the walk's throughout.
-    A picture is cut into bands of rows so that one camera, too, keeps all threads busy; the result does not depend on
-    it.
+    In doubt is a pixel whose ray comes within about a millionth of a pixel of the outline of a face, or of the border
+    between two voxels of one, where rounding, or the rule for rays that touch an edge, decides. Those rays are walked,
+    so that the image is the walk's throughout. A picture is cut into bands of rows so that one camera, too, keeps all
+    threads busy; the result does not depend on it.
     """
     if not views:
         return []
@@ -86,11 +86,14 @@ def _band(
     M, near = rays.M, 0.999 * clearance(occupied, rays.origin) / rays.longest
     doubt = np.empty(depth.size // _DOUBTS + 64, np.int32)
     found = _raster_kernels.raster(faces, M, np.linalg.inv(M), rays.origin, near, max_depth, top, doubt, depth, voxel)
-    if found > len(doubt):
-        pixels = np.arange(top * width, bottom * width)
-    else:
-        _raster_kernels.resolve(faces, rays.lens, rays.R, rays.origin, occupied.shape, max_depth, top, depth, voxel)
+    if found <= len(doubt):
+        found = _raster_kernels.resolve(
+            faces, rays.lens, rays.R, rays.origin, occupied.shape, max_depth, top, found, doubt, depth, voxel
+        )
+    if found <= len(doubt):
         pixels = np.unique(doubt[:found]).astype(np.int64) + top * width
+    else:
+        pixels = np.arange(top * width, bottom * width)
     directions = rays.directions(pixels)
     t, hit = np.empty(len(pixels), np.float32), np.empty(len(pixels), np.int32)
     first_hits(rays.origin[None], directions, occupied, max_depth, 0, len(pixels), t, hit)
