@@ -41,6 +41,10 @@ def raster(faces, M, P, o, near, max_depth, row0, doubt, inverse, winner):
     clipped = np.empty((8, 3))
     px = np.empty(8)
     py = np.empty(8)
+    upper = np.empty(8)
+    lower = np.empty(8)
+    lean = np.empty(8)
+    around = np.empty(8)
     for f in range(faces.shape[0]):
         kind = faces[f, 0]
         axis = kind >> 1
@@ -117,27 +121,29 @@ def raster(faces, M, P, o, near, max_depth, row0, doubt, inverse, winner):
         C = M[axis, 2] / h
         slope = np.float32(A)
         number = np.int32(f)
+        for k in range(m):
+            k2 = k + 1 if k + 1 < m else 0
+            upper[k] = min(py[k], py[k2])
+            lower[k] = max(py[k], py[k2])
+            # level with the scan line: all of it is outline
+            level = lower[k] - upper[k] <= 4.0 * band
+            lean[k] = 0.0 if level else (px[k2] - px[k]) / (py[k2] - py[k])
+            around[k] = math.inf if level else band * (1.0 + abs(lean[k]))
         for y in range(y0, y1 + 1):
             low = math.inf
             high = -math.inf
             slack = 0.0
             for k in range(m):
-                k2 = k + 1 if k + 1 < m else 0
-                ya = py[k]
-                yb = py[k2]
-                if ya > yb:
-                    ya, yb = yb, ya
-                if ya - band <= y <= yb + band:
-                    if yb - ya <= 4.0 * band:  # level with the scan line: all of it is outline
-                        low = min(low, px[k], px[k2])
-                        high = max(high, px[k], px[k2])
-                        slack = math.inf
-                    else:
-                        lean = (px[k2] - px[k]) / (py[k2] - py[k])
-                        x = px[k] + (min(max(y, ya), yb) - py[k]) * lean
-                        low = min(low, x)
-                        high = max(high, x)
-                        slack = max(slack, band * (1.0 + abs(lean)))
+                if upper[k] - band <= y <= lower[k] + band:
+                    x = px[k] + (min(max(y, upper[k]), lower[k]) - py[k]) * lean[k]
+                    low = min(low, x)
+                    high = max(high, x)
+                    slack = max(slack, around[k])
+            if slack == math.inf:  # the ends of level edges
+                for k in range(m):
+                    if abs(py[k] - y) <= 5.0 * band:
+                        low = min(low, px[k])
+                        high = max(high, px[k])
             reach = slack if slack < math.inf else band
             x0 = math.ceil(max(low - reach, 0.0))
             x1 = math.floor(min(high + reach, width - 1.0))

@@ -57,7 +57,7 @@ def raster(
     if not views:
         return []
     faces, occupied = grid.faces, grid.occupied
-    images = [DepthImage(np.empty(v.size, np.float32), np.empty(v.size, np.int32)) for v in views]
+    images = [DepthImage.empty(*v.size) for v in views]
     bands = -(-2 * num_threads() // len(views)) if num_threads() > 1 else 1
     doubts: list[Int[np.ndarray, " pixels"]] = [np.empty(0, np.int64)] * (len(views) * bands)
 
