@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8, UInt16
+from jaxtyping import Bool, Float32, Float64, Int, Int32, Int64, UInt8, UInt16
 
 from openvocab_occ.arrays import check_finite, check_shape
 from openvocab_occ.errors import ConfigError, DataError, ShapeError
@@ -163,6 +163,10 @@ class VoxelMap:
         packed = pack(keys)
         at = np.minimum(np.searchsorted(self._packed, packed), len(self) - 1)
         return np.where((self._packed[at] == packed) & packable(keys), at, -1)
+
+    def centers_at(self, positions: Int[np.ndarray, " m"]) -> Float64[np.ndarray, "m 3"]:
+        """Return the centres of the voxels at some positions, metres in the world."""
+        return (unpack(self._packed[positions]) + 0.5) * self.voxel_size
 
     def integrate(
         self,
