@@ -35,7 +35,7 @@ class SegmentConfig:
     """The k of the segmentation: a component of n voxels bears edges k / n above its heaviest."""
     class_penalty: float = 0.5
     """Added to the distance of neighbours of which occupancy names different classes; 0 ignores classes."""
-    join: float = 0.5
+    join: float = 0.75
     """Touching components of one class whose mean features are no further apart than this are one: a wall is one wall
     though its windows differ. Of things that can move any distance will do: cab and box are one truck."""
     reach: int = 24

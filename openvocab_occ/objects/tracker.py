@@ -65,13 +65,14 @@ class Tracker:
         self._cells: defaultdict[int, set[int]] = defaultdict(set)  # coarse cell -> tracks
         self._lately: dict[int, float] = {}  # tracks that may be elsewhere by now, and when they were seen
         self._next = 1
-        self._time = -np.inf
 
     def observe(self, segments: Sequence[Segment], *, frame: int, time: float) -> list[int]:
-        """Give each segment its track, new or known; return their ids. Frames come in order of time."""
-        if not np.isfinite(time) or time < self._time:
-            raise DataError(f"frame {frame} comes before one already tracked", expected=f">= {self._time} s", got=time)
-        self._time = time
+        """Give each segment its track, new or known; return their ids.
+
+        Frames may come in any order, but what moves is followed best in order of time.
+        """
+        if not np.isfinite(time):
+            raise DataError(f"time of frame {frame} is not finite", expected="seconds", got=time)
         cells = [coarse(s.body).tolist() for s in segments]
         shared = [self._shared(c) for c in cells]
         ids = self._assign(segments, cells, shared, time)
@@ -92,7 +93,7 @@ class Tracker:
             if found == 0:
                 ids[number] = self._birth(segments[number], frame, time)
         self._remember(segments, ids, cells, shared)
-        self._lately = {id: t for id, t in self._lately.items() if time - t <= self.config.occlusion}
+        self._lately = {id: t for id, t in self._lately.items() if abs(time - t) <= self.config.occlusion}
         return ids
 
     def forget(self, id: int, into: int | None = None) -> None:
@@ -148,7 +149,7 @@ class Tracker:
             track = self.tracks[id]
             reach = 2 * self.config.motion_sigma
             if len(track.bounds) < 2:
-                reach += self.config.top_speed * (time - track.last_time)
+                reach += self.config.top_speed * abs(time - track.last_time)
             if np.linalg.norm(segment.center[:2] - self._expected(track, time)) <= reach:
                 near.append(id)
         return near
@@ -175,7 +176,7 @@ class Tracker:
         off = float(np.linalg.norm(segment.center[:2] - self._expected(track, time)))
         sigma = config.motion_sigma
         if len(track.bounds) < 2:  # it may be anywhere within reach; the nearest is the likeliest
-            sigma += config.top_speed * (time - track.last_time) / 3
+            sigma += config.top_speed * abs(time - track.last_time) / 3
         return config.overlap * overlap + likeness + config.motion * float(np.exp(-0.5 * (off / sigma) ** 2))
 
     def _may_move(self, votes: np.ndarray) -> bool:

@@ -1,10 +1,11 @@
 """Tracks: segments of many frames that are one thing."""
 
 from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 
 from openvocab_occ.mapping.keys import pack, unpack
 from openvocab_occ.objects.kinds import Kind, kinds_of
@@ -12,7 +13,10 @@ from openvocab_occ.objects.segments import Crop, Segment
 from openvocab_occ.objects.state import Motion, StateConfig, observe_motion, shift
 
 BEST_CROPS = 5
+_BODIES = 6
 _HISTORY = 64  # sightings kept for motion; every other one goes when there are more
+
+_AROUND = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)])
 
 
 @dataclass(eq=False)
@@ -42,6 +46,8 @@ class Track:
     """Of the motion model, metres a second."""
     moved: bool = False
     """True once it moved further than sightings err; its older voxels are then a trail, not the thing."""
+    bodies: list[Int64[np.ndarray, " n"]] = field(default_factory=list[np.ndarray])
+    """Packed keys, hidden ones included, of its latest sightings that show where it ends."""
     _pieces: list[Int64[np.ndarray, " n"]] = field(default_factory=list[np.ndarray])
     _compacted: int = 0
 
@@ -59,11 +65,15 @@ class Track:
             self._measure(segment, time)
         self.frames.append(frame)
         self.times.append(time)
-        if self.moved:
-            self._pieces, self._compacted = [], 0
-        self._pieces.append(segment.seen)
+        if time >= self.last_time:
+            self.last, self.last_time = segment, time
+            if self.moved:
+                self._pieces, self._compacted = [], 0
+            if not segment.cut_off or not self.bodies:
+                self.bodies = [*self.bodies, segment.body][-_BODIES:]
+        if self.last is segment or not self.moved:
+            self._pieces.append(segment.seen)
         self._compact()
-        self.last, self.last_time = segment, time
 
     def absorb(self, other: "Track") -> None:
         """Become what both are."""
@@ -83,13 +93,22 @@ class Track:
         self.bound_times = sorted(bounds)
         self.bounds = [bounds[time] for time in self.bound_times]
         self._keep_crops(other.crops)
-        self.cells |= other.cells
+        self.cells = self.cells | other.cells
         self.moved = self.moved or other.moved
         if other.last is not None and (self.last is None or other.last_time > self.last_time):
             self.last, self.last_time = other.last, other.last_time
             self.velocity = other.velocity
+            self.bodies = other.bodies
         self._pieces = [self.last.seen] if self.moved and self.last is not None else self._pieces + other._pieces
         self._compacted = 0
+
+    def of_voxels(self, packed: Int64[np.ndarray, " n"], id: int) -> "Track":
+        """Return a track of some of the voxels, with the rest of what is known of the whole."""
+        part = copy(self)
+        part.id, part._pieces, part._compacted = id, [packed], len(packed)
+        part.bodies = [body[near(body, packed)] for body in self.bodies]
+        part.bodies = [body for body in part.bodies if len(body)]
+        return part
 
     @property
     def voxels(self) -> Int64[np.ndarray, " n"]:
@@ -110,15 +129,30 @@ class Track:
 
     def motion(self, config: StateConfig | None = None) -> Motion:
         """Sum up what was seen of its motion."""
-        bounds = np.array(self.bounds, dtype=np.float64).reshape(-1, 4)
+        times, bounds = self._history()
         return observe_motion(
-            np.array(self.bound_times, dtype=np.float64), bounds[:, :2], bounds[:, 2:], sightings=len(self.frames),
-            time_observed=self.times[-1] - self.times[0], voxel_size=self.voxel_size, config=config,
+            times, bounds[:, :2], bounds[:, 2:], sightings=len(self.frames),
+            time_observed=max(self.times) - min(self.times), voxel_size=self.voxel_size, config=config,
         )  # fmt: skip
+
+    def heading(self) -> float | None:
+        """Return the direction of its latest clear motion, radians; None where there was none."""
+        _, bounds = self._history()
+        for back in range(2, len(bounds) + 1):
+            way = shift(bounds[-back, :2], bounds[-back, 2:], bounds[-1, :2], bounds[-1, 2:])
+            if np.linalg.norm(way) >= max(1.0, 2 * self.voxel_size):
+                return float(np.arctan2(way[1], way[0]))
+        return None
 
     def predicted(self, time: float) -> Float64[np.ndarray, " 2"]:
         """Return how far it went since it was last seen if it kept its velocity, metres along x and y."""
         return self.velocity * (time - self.last_time)
+
+    def _history(self) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n 4"]]:
+        """Return times and bounds of the sightings that tell motion, in order of time."""
+        order = np.argsort(self.bound_times, kind="stable")
+        bounds = np.array(self.bounds, dtype=np.float64).reshape(-1, 4)
+        return np.array(self.bound_times, dtype=np.float64)[order], bounds[order]
 
     def _add_evidence(self, segment: Segment) -> None:
         self.feature_sum = self.feature_sum + segment.feature_sum
@@ -133,7 +167,8 @@ class Track:
             measured = shift(low0, high0, low, high) / (time - before)
             fresh = 1.0 if len(self.bounds) < 2 else 0.6  # a steady-state alpha-beta filter of constant velocity
             self.velocity = self.velocity + fresh * (measured - self.velocity)
-        self.previous = (time, low, high)
+        if self.previous is None or time > self.previous[0]:
+            self.previous = (time, low, high)
         self.bound_times.append(time)
         self.bounds.append(np.r_[low, high])
         if len(self.bounds) > _HISTORY:
@@ -152,6 +187,13 @@ class Track:
         if len(self._pieces) > 1 and (force or size > 2 * self._compacted + 64):
             self._pieces = [np.unique(np.concatenate(self._pieces))]
             self._compacted = len(self._pieces[0])
+
+
+def near(packed: Int64[np.ndarray, " n"], others: Int64[np.ndarray, " m"]) -> Bool[np.ndarray, " n"]:
+    """Tell which keys have one of the others among the coarse cells about them."""
+    cells = unpack(coarse(others))
+    around = np.unique(pack((cells[:, None] + _AROUND).reshape(-1, 3).astype(np.int32)))
+    return np.isin(pack(unpack(packed) >> 1), around)
 
 
 def joined(a: Segment, b: Segment) -> Segment:

@@ -1,0 +1,86 @@
+"""The builder of objects: frames come in one by one, a tree comes out at any time."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from openvocab_occ.mapping import VoxelMap
+from openvocab_occ.objects.describe import describe
+from openvocab_occ.objects.frame_voxels import FrameVoxels
+from openvocab_occ.objects.refine import RefineConfig, Refinement, owners, refine
+from openvocab_occ.objects.segments import SegmentConfig, segment_frame
+from openvocab_occ.objects.state import StateConfig
+from openvocab_occ.objects.tracker import TrackConfig, Tracker
+from openvocab_occ.objects.tree import ObjectTree, SceneObject
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectConfig:
+    """How voxels become objects, stage by stage."""
+
+    segments: SegmentConfig = field(default_factory=SegmentConfig)
+    tracks: TrackConfig = field(default_factory=TrackConfig)
+    states: StateConfig = field(default_factory=StateConfig)
+    refine: RefineConfig = field(default_factory=RefineConfig)
+
+
+class ObjectBuilder:
+    """Follows the things of a drive. Mutable."""
+
+    def __init__(
+        self, voxel_size: float, *, names: Sequence[str] = (), labels: Sequence[str] = (),
+        config: ObjectConfig | None = None,
+    ) -> None:  # fmt: skip
+        """Begin without objects.
+
+        Args:
+            voxel_size: Metres.
+            names: Classes of the occupancy; none where it knows shapes only.
+            labels: Channels of a `logits` model; they stand in for classes where the occupancy names none.
+            config: Options of all stages.
+        """
+        self.config = config or ObjectConfig()
+        self.names = tuple(names) if len(names) > 2 else tuple(labels)
+        self.labels = tuple(labels)
+        self.report = Refinement(tracks=0)
+        """What the last batch refinement did."""
+        self._tracker = Tracker(voxel_size, self.names, self.config.tracks)
+
+    @property
+    def tracker(self) -> Tracker:
+        """The tracks as they are, before batch refinement."""
+        return self._tracker
+
+    def observe(self, frame: FrameVoxels) -> list[int]:
+        """Add a frame and return the track of each of its segments."""
+        segments = segment_frame(frame, self.names, self.config.segments)
+        return self._tracker.observe(segments, frame=frame.index, time=frame.timestamp)
+
+    def objects(self, voxels: VoxelMap) -> list[SceneObject]:
+        """Return the objects of all frames so far, after batch refinement; ids are those of the tracks."""
+        tracks, self.report = refine(
+            self._tracker.tracks, together=self._tracker.together, apart=self._tracker.apart, names=self.names,
+            config=self.config.refine,
+        )  # fmt: skip
+        return [
+            describe(track, packed, voxels, names=self.names, labels=self.labels, config=self.config.states)
+            for track, packed in zip(tracks, owners(tracks), strict=True)
+            if len(packed)
+        ]
+
+    def tree(self, voxels: VoxelMap, ego: Sequence[np.ndarray] = ()) -> ObjectTree:
+        """Return the tree of all frames so far; `ego` are the poses of the frames, which tell where the road leads."""
+        from openvocab_occ.objects.hierarchy import build_tree
+
+        return build_tree(self.objects(voxels), voxels, names=self.names, labels=self.labels, ego=ego)
+
+
+def claimed(objects: Sequence[SceneObject], voxels: VoxelMap) -> np.ndarray:
+    """Tell which voxels of a map belong to an object, bool[n]."""
+    taken = np.zeros(len(voxels), dtype=bool)
+    for item in objects:
+        taken[item.voxels] = True
+    return taken
+
+

@@ -1,0 +1,145 @@
+"""Tracks become objects: box, embedding, names, state and the evidence for it."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from openvocab_occ.mapping import VoxelMap
+from openvocab_occ.mapping.keys import unpack
+from openvocab_occ.objects.box import Box, principal_yaw
+from openvocab_occ.objects.refine import class_of
+from openvocab_occ.objects.state import StateConfig, judge
+from openvocab_occ.objects.tracks import Track
+from openvocab_occ.objects.tree import SceneObject, Sighting
+from openvocab_occ.segmentation.encoder import Contract
+
+TOP_NAMES = 5
+Namer = Callable[[Float32[np.ndarray, "n c"]], list[tuple[tuple[str, float], ...]]]
+"""Embeddings to their best words and scores."""
+
+
+def describe(
+    track: Track,
+    packed: Int64[np.ndarray, " n"],
+    voxels: VoxelMap,
+    *,
+    names: Sequence[str],
+    labels: Sequence[str] = (),
+    config: StateConfig | None = None,
+) -> SceneObject:
+    """Return the object of a track.
+
+    Args:
+        track: Refined.
+        packed: Keys of its voxels that belong to no other object.
+        voxels: The map the object will stand in; the voxels of what moved are not in it.
+        names: Classes that the track counts votes for.
+        labels: Channels of a `logits` map.
+        config: When a thing counts as moved, and as parked.
+    """
+    motion = track.motion(config)
+    movable = track.movable(names)
+    state, confidence, evidence = judge(motion, movable=movable, config=config)
+    keys = unpack(packed)
+    positions = voxels.index(keys)
+    there = positions >= 0
+    if there.any() and state not in ("moving",):
+        keys = keys[there]
+    contract: Contract = voxels.contract
+    embedding = unit(track.feature_sum, contract)
+    name = class_of(track, names)
+    if contract == "logits" and labels:
+        best = int(embedding.argmax())
+        label, score = labels[best], float(embedding[best])
+        top = [int(i) for i in np.argsort(-embedding, kind="stable")[:TOP_NAMES] if embedding[i] > 0]
+        words = tuple((labels[i], float(embedding[i])) for i in top)
+    else:
+        total = float(track.class_votes.sum())
+        label, score = name, (float(track.class_votes.max()) / total if total > 0 else 0.0)
+        words = ()
+    going = state in ("moving", "stopped")
+    heading = track.heading() if going else None
+    crops = track.crops
+    return SceneObject(
+        id=track.id,
+        label=label,
+        score=score,
+        box=fit_box(track, packed if state != "moving" else unpack_last(track), heading if state == "moving" else None),
+        voxels=np.sort(positions[there]).astype(np.int64),
+        points=((keys + 0.5) * voxels.voxel_size).astype(np.float32),
+        embedding=embedding,
+        state=state,
+        parent=0,
+        views=tuple(Sighting(c.frame, c.view, c.box) for c in crops),
+        evidence=evidence,
+        confidence=confidence,
+        heading=heading,
+        speed=motion.speed if going else 0.0,
+        times_seen=len(track.frames),
+        first_seen=min(track.times),
+        last_seen=max(track.times),
+        best_embedding=unit(np.sum([c.feature * c.score for c in crops], axis=0), contract) if crops else None,
+        agreement=float(np.linalg.norm(track.feature_sum)) / max(track.weight, 1e-9) if contract == "dense" else 1.0,
+        names=words,
+    )
+
+
+def unpack_last(track: Track) -> Int64[np.ndarray, " n"]:
+    """Return the packed keys of the latest sighting."""
+    assert track.last is not None, "a track has at least one sighting"
+    return track.last.seen
+
+
+def unit(vector: np.ndarray, contract: Contract) -> Float32[np.ndarray, " c"]:
+    """Return a sum of features as a unit vector, or of distributions as one; zeros stay."""
+    norm = float(vector.sum()) if contract == "logits" else float(np.linalg.norm(vector))
+    return (vector / norm if norm > 0 else vector).astype(np.float32)
+
+
+def fit_box(track: Track, packed: Int64[np.ndarray, " n"], heading: float | None = None) -> Box:
+    """Return the upright box of a thing: of the bodies that its latest sightings show, else of its voxels.
+
+    Sides are medians over the sightings, for a lattice that turns with the ego makes each a little different. Of a
+    moving thing the latest sighting and its heading count.
+    """
+    size = track.voxel_size
+    bodies = track.bodies or [packed]
+    if heading is not None or track.moved:
+        bodies = bodies[-1:]
+    corners = [(unpack(body) + 0.5) * size for body in bodies]
+    yaw = heading if heading is not None else _yaw(corners, track, size)
+    yaw = (yaw + np.pi / 2) % np.pi - np.pi / 2
+    c, s = np.cos(yaw), np.sin(yaw)
+    turn = np.array([[c, -s], [s, c]])
+    low, high = np.empty((len(corners), 3)), np.empty((len(corners), 3))
+    for i, points in enumerate(corners):
+        local = np.c_[points[:, :2] @ turn, points[:, 2]]
+        low[i], high[i] = local.min(axis=0) - size / 2, local.max(axis=0) + size / 2
+    lower, upper = np.median(low, axis=0), np.median(high, axis=0)
+    middle = (lower + upper) / 2
+    extent = upper - lower
+    center = np.r_[turn @ middle[:2], middle[2]]
+    if extent[1] > extent[0]:
+        extent, yaw = extent[[1, 0, 2]], yaw - np.pi / 2 if yaw > 0 else yaw + np.pi / 2
+    return Box(center, extent, float(yaw))
+
+
+def _yaw(corners: Sequence[Float64[np.ndarray, "n 3"]], track: Track, size: float) -> float:
+    """Return the angle whose rectangles around the sightings have the least area together.
+
+    Angles within a degree and a half of the spread's own axis are not told apart by whole voxels: it wins.
+    """
+    spread = principal_yaw(np.concatenate([p[:, :2] for p in corners]))
+    tried = np.unique(np.round(np.r_[np.arange(0.0, 90.0, 3.0), np.rad2deg(spread) % 90], 6))
+    flat = [np.unique(p[:, :2], axis=0) for p in corners]
+
+    def area(degrees: float) -> float:
+        a = np.deg2rad(degrees)
+        turn = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
+        return sum(float(np.prod(np.ptp(p @ turn, axis=0) + size * 0.5)) for p in flat)
+
+    areas = np.array([area(d) for d in tried])
+    own = area(float(np.rad2deg(spread) % 90))
+    best = int(areas.argmin())
+    return spread if own <= 1.05 * areas[best] else float(np.deg2rad(tried[best]))
