@@ -9,7 +9,7 @@ from openvocab_occ.mapping import VoxelMap
 from openvocab_occ.objects.describe import describe
 from openvocab_occ.objects.frame_voxels import FrameVoxels
 from openvocab_occ.objects.refine import RefineConfig, Refinement, owners, refine
-from openvocab_occ.objects.segments import SegmentConfig, segment_frame
+from openvocab_occ.objects.segments import Segment, SegmentConfig, segment_frame
 from openvocab_occ.objects.state import StateConfig
 from openvocab_occ.objects.tracker import TrackConfig, Tracker
 from openvocab_occ.objects.tree import ObjectTree, SceneObject
@@ -23,6 +23,17 @@ class ObjectConfig:
     tracks: TrackConfig = field(default_factory=TrackConfig)
     states: StateConfig = field(default_factory=StateConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Observation:
+    """What one frame gave."""
+
+    frame: int
+    """Its index."""
+    segments: tuple[Segment, ...]
+    tracks: tuple[int, ...]
+    """Track of each segment, before batch refinement."""
 
 
 class ObjectBuilder:
@@ -45,6 +56,10 @@ class ObjectBuilder:
         self.labels = tuple(labels)
         self.report = Refinement(tracks=0)
         """What the last batch refinement did."""
+        self.merged: dict[int, int] = {}
+        """Tracks that the last batch refinement merged into others, and into which."""
+        self.latest: Observation | None = None
+        """What the last frame gave."""
         self._tracker = Tracker(voxel_size, self.names, self.config.tracks)
 
     @property
@@ -52,14 +67,16 @@ class ObjectBuilder:
         """The tracks as they are, before batch refinement."""
         return self._tracker
 
-    def observe(self, frame: FrameVoxels) -> list[int]:
-        """Add a frame and return the track of each of its segments."""
+    def observe(self, frame: FrameVoxels) -> Observation:
+        """Add a frame and return what was seen in it."""
         segments = segment_frame(frame, self.names, self.config.segments)
-        return self._tracker.observe(segments, frame=frame.index, time=frame.timestamp)
+        ids = self._tracker.observe(segments, frame=frame.index, time=frame.timestamp)
+        self.latest = Observation(frame=frame.index, segments=tuple(segments), tracks=tuple(ids))
+        return self.latest
 
     def objects(self, voxels: VoxelMap) -> list[SceneObject]:
         """Return the objects of all frames so far, after batch refinement; ids are those of the tracks."""
-        tracks, self.report = refine(
+        tracks, self.report, self.merged = refine(
             self._tracker.tracks, together=self._tracker.together, apart=self._tracker.apart, names=self.names,
             config=self.config.refine,
         )  # fmt: skip

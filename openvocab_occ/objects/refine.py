@@ -52,8 +52,10 @@ def refine(
     apart: Set[Pair],
     names: Sequence[str],
     config: RefineConfig | None = None,
-) -> tuple[list[Track], Refinement]:
-    """Return refined copies of tracks, by id, and what was done to them; the tracks themselves stay as they are.
+) -> tuple[list[Track], Refinement, dict[int, int]]:
+    """Return refined copies of tracks by id, what was done to them, and the ids that went into others.
+
+    The tracks themselves stay as they are.
 
     Args:
         tracks: By id.
@@ -65,13 +67,15 @@ def refine(
     config = config or RefineConfig()
     done = Refinement(tracks=len(tracks))
     kept = {id: copy(track) for id, track in tracks.items()}
+    into: dict[int, int] = {}
     if config.merge:
-        done = replace(done, merged=_merge(kept, together, apart, names, config))
+        into = _merge(kept, together, apart, names, config)
+        done = replace(done, merged=len(into))
     if config.split:
         done = replace(done, split=_split(kept, names))
     if config.drop:
         done = replace(done, dropped=_drop(kept, config))
-    return [kept[id] for id in sorted(kept)], replace(done, objects=len(kept))
+    return [kept[id] for id in sorted(kept)], replace(done, objects=len(kept)), into
 
 
 def class_of(track: Track, names: Sequence[str]) -> str:
@@ -81,7 +85,7 @@ def class_of(track: Track, names: Sequence[str]) -> str:
 
 def _merge(
     kept: dict[int, Track], together: Mapping[Pair, int], apart: Set[Pair], names: Sequence[str], config: RefineConfig
-) -> int:
+) -> dict[int, int]:
     """Merge pairs that segments covered together, those most often so first; the lower id stays."""
     into: dict[int, int] = {}
     barred: defaultdict[int, set[int]] = defaultdict(set)
@@ -94,7 +98,6 @@ def _merge(
             id = into[id]
         return id
 
-    count = 0
     for (a, b), frames in sorted(together.items(), key=lambda item: (-item[1], item[0])):
         a, b = sorted((home(a), home(b)))
         if a == b or a not in kept or b not in kept:
@@ -111,8 +114,7 @@ def _merge(
         barred[a] |= barred[b]
         for other in barred[b]:
             barred[other].add(a)
-        count += 1
-    return count
+    return {id: home(id) for id in into}
 
 
 def _split(kept: dict[int, Track], names: Sequence[str]) -> int:

@@ -193,6 +193,11 @@ class MapBuilder:
         cameras = tuple(NamedCamera.of(view.camera, view.name) for view in frame.views)
         self._frames.append(KeyFrame(frame.index, frame.timestamp, frame.T_world_ego, cameras))
 
+    @property
+    def objects(self) -> ObjectBuilder | None:
+        """What follows the things of the drive; None before the first frame."""
+        return self._objects
+
     def snapshot(self) -> SceneMap:
         """Return the map of all frames so far; it does not change when more follow.
 
