@@ -85,6 +85,10 @@ class Traversal:
         """Which vehicle drove."""
         day = np.random.default_rng([town.seed, 51, number])
         self._azimuth, self._drift = float(day.uniform(-np.pi, np.pi)), float(day.uniform(0, 50))
+        self.num_frames = MAX_FRAMES
+        """Keyframes that count as the time of observation."""
+        self.moved_by: dict[int, float] = {}
+        """How far movers move while observed, as far as it was asked."""
         self._places: OrderedDict[tuple[int, int], Surroundings] = OrderedDict()
 
     @cached_property
