@@ -139,7 +139,9 @@ def splat(v, faces, chosen, labels, owners, closed, fill, weight, per_voxel, x0,
             for d in range(1, 3):
                 if abs(n[d]) > abs(n[axis]):
                     axis = d
-            _sheet(a, u, w, n, axis, x0, x1, int(math.ceil(per_voxel)), doubled, label, owner, weight, area, best, instance)
+            _sheet(
+                a, u, w, n, axis, x0, x1, int(math.ceil(per_voxel)), doubled, label, owner, weight, area, best, instance
+            )
         elif (
             x == int(math.floor(high)) and 0 <= y < Y and 0 <= z < Z
             and y == int(math.floor(a[1] + min(0.0, u[1], w[1]))) and y == int(math.floor(a[1] + max(0.0, u[1], w[1])))

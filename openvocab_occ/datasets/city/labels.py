@@ -49,9 +49,11 @@ def observed(
 
 def camera_directions(camera: Camera) -> Float[np.ndarray, "n 3"]:
     """Return rays through every so many pixels, in the world."""
-    small = camera.resized(max(camera.width * 234 // 704, 1), max(camera.height * 234 // 704, 1)) if (
-        camera.width > 234
-    ) else camera
+    small = (
+        camera.resized(max(camera.width * 234 // 704, 1), max(camera.height * 234 // 704, 1))
+        if (camera.width > 234)
+        else camera
+    )
     return small.rays().reshape(-1, 3) @ camera.T_world_cam[:3, :3].T
 
 

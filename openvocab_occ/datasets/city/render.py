@@ -83,9 +83,9 @@ def render(
 
 def _camera_rays(camera: Camera) -> Float32[np.ndarray, "n 6"]:
     """Return origins and directions with z = 1 in the camera, so that the length along them is the z-depth."""
-    directions = _pixel_directions(camera.K.tobytes(), camera.width, camera.height) @ camera.T_world_cam[:3, :3].T.astype(
-        np.float32
-    )
+    directions = _pixel_directions(camera.K.tobytes(), camera.width, camera.height) @ camera.T_world_cam[
+        :3, :3
+    ].T.astype(np.float32)
     rays = np.empty((len(directions), 6), dtype=np.float32)
     rays[:, :3], rays[:, 3:] = camera.position, directions
     return rays

@@ -33,5 +33,9 @@ def load_city(
     drive = _city(seed).traversal(route, traversal, condition)
     width, height = size
     return FrameSequence(
-        drive.name, range(frames), lambda index: frame(drive, index, size=(width, height)), source="city", synthetic=True
+        drive.name,
+        range(frames),
+        lambda index: frame(drive, index, size=(width, height)),
+        source="city",
+        synthetic=True,
     )

@@ -168,6 +168,10 @@ class Traversal:
         moment = Moment(around.caster, Caster(table.vertices, table.faces), len(around.triangles))
         return Instant(joined(around.triangles, table), moment, around, tuple(self.movers[i] for i in near))
 
+    def forget(self) -> None:
+        """Drop what was gathered around places, to save memory."""
+        self._places.clear()
+
     def moved(self, instant: Instant, time: float) -> Moment:
         """Return how rays fall a little earlier or later; the table of triangles keeps its rows."""
         around, still = instant.surroundings, len(instant.surroundings.triangles)

@@ -66,9 +66,7 @@ class _Scratch(threading.local):
 _scratch = _Scratch()
 
 
-def voxelise(
-    triangles: Triangles, T_grid_local: Float[np.ndarray, "4 4"], spec: GridSpec = OCC3D_SPEC
-) -> Voxels:
+def voxelise(triangles: Triangles, T_grid_local: Float[np.ndarray, "4 4"], spec: GridSpec = OCC3D_SPEC) -> Voxels:
     """Label a grid.
 
     Args:
