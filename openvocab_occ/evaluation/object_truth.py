@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Int32
 
+from openvocab_occ.datasets.city import Traversal, keyframes
 from openvocab_occ.datasets.frame import Frame
 from openvocab_occ.datasets.street import Street
 from openvocab_occ.objects.box import Box
@@ -72,4 +73,27 @@ class StreetTruth:
             low, high = thing.bounds(frame.timestamp)
             box = Box((low + high) / 2, high - low, 0.0)
             found[id] = TrueThing(id=id, label=OCC3D_CLASSES[thing.label], box=box)
+        return found
+
+
+class CityTruth:
+    """The truth of a drive through the demo city."""
+
+    def __init__(self, drive: Traversal) -> None:
+        self._drive = drive
+        names = {id: about.name for id, about in drive.attributes().items()}
+        self._labels = {id: name for id, name in names.items() if kind_of(name) != Kind.GROUND}
+        self._solid = np.array(sorted(self._labels), dtype=np.int32)
+
+    def instances(self, frame: Frame) -> Int32[np.ndarray, "x y z"]:
+        """Return the id of the thing that most of each voxel is; 0 for ground and air."""
+        ids = keyframes.labels(self._drive, frame.index, masks=False).instances
+        return np.where(np.isin(ids, self._solid), ids, 0).astype(np.int32)
+
+    def things(self, frame: Frame) -> Mapping[int, TrueThing]:
+        """Return the things within reach, where they are at the frame's time."""
+        found = {id: TrueThing(id=id, label=label) for id, label in self._labels.items()}
+        for box in keyframes.boxes(self._drive, frame.index):
+            upright = Box(np.array(box.center), np.array(box.size), box.yaw)
+            found[box.id] = TrueThing(id=box.id, label=OCC3D_CLASSES[box.label], box=upright)
         return found

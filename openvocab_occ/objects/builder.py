@@ -1,12 +1,15 @@
 """The builder of objects: frames come in one by one, a tree comes out at any time."""
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field
+from time import perf_counter
 
 import numpy as np
+from jaxtyping import Int64
 
 from openvocab_occ.mapping import VoxelMap
-from openvocab_occ.objects.describe import describe
+from openvocab_occ.objects.describe import describe, state_of
 from openvocab_occ.objects.frame_voxels import FrameVoxels
 from openvocab_occ.objects.refine import RefineConfig, Refinement, owners, refine
 from openvocab_occ.objects.segments import Segment, SegmentConfig, segment_frame
@@ -31,6 +34,8 @@ class Observation:
 
     frame: int
     """Its index."""
+    seen: Int64[np.ndarray, " n"]
+    """Packed keys of the voxels that a camera saw, ascending."""
     segments: tuple[Segment, ...]
     tracks: tuple[int, ...]
     """Track of each segment, before batch refinement."""
@@ -58,6 +63,8 @@ class ObjectBuilder:
         """What the last batch refinement did."""
         self.merged: dict[int, int] = {}
         """Tracks that the last batch refinement merged into others, and into which."""
+        self.seconds = 0.0
+        """What segments and tracks of the last frame took."""
         self.latest: Observation | None = None
         """What the last frame gave."""
         self._tracker = Tracker(voxel_size, self.names, self.config.tracks)
@@ -69,20 +76,27 @@ class ObjectBuilder:
 
     def observe(self, frame: FrameVoxels) -> Observation:
         """Add a frame and return what was seen in it."""
+        start = perf_counter()
         segments = segment_frame(frame, self.names, self.config.segments)
         ids = self._tracker.observe(segments, frame=frame.index, time=frame.timestamp)
-        self.latest = Observation(frame=frame.index, segments=tuple(segments), tracks=tuple(ids))
+        self.seconds = perf_counter() - start
+        self.latest = Observation(
+            frame=frame.index, seen=frame.packed[frame.seen], segments=tuple(segments), tracks=tuple(ids)
+        )
         return self.latest
 
     def objects(self, voxels: VoxelMap) -> list[SceneObject]:
         """Return the objects of all frames so far, after batch refinement; ids are those of the tracks."""
-        tracks, self.report, self.merged = refine(
-            self._tracker.tracks, together=self._tracker.together, apart=self._tracker.apart, names=self.names,
+        tracks = {id: copy(track) for id, track in self._tracker.tracks.items()}
+        for track in tracks.values():
+            track.moved = state_of(track, voxels, self.names, self.config.states)[0] in ("moving", "stopped")
+        refined, self.report, self.merged = refine(
+            tracks, together=self._tracker.together, apart=self._tracker.apart, names=self.names,
             config=self.config.refine,
         )  # fmt: skip
         return [
             describe(track, packed, voxels, names=self.names, labels=self.labels, config=self.config.states)
-            for track, packed in zip(tracks, owners(tracks), strict=True)
+            for track, packed in zip(refined, owners(refined), strict=True)
             if len(packed)
         ]
 

@@ -1,6 +1,7 @@
 """Tracks become objects: box, embedding, names, state and the evidence for it."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
@@ -9,7 +10,7 @@ from openvocab_occ.mapping import VoxelMap
 from openvocab_occ.mapping.keys import unpack
 from openvocab_occ.objects.box import Box, principal_yaw
 from openvocab_occ.objects.refine import class_of
-from openvocab_occ.objects.state import StateConfig, judge
+from openvocab_occ.objects.state import Motion, State, StateConfig, judge
 from openvocab_occ.objects.tracks import Track
 from openvocab_occ.objects.tree import SceneObject, Sighting
 from openvocab_occ.segmentation.encoder import Contract
@@ -39,8 +40,7 @@ def describe(
         config: When a thing counts as moved, and as parked.
     """
     motion = track.motion(config)
-    movable = track.movable(names)
-    state, confidence, evidence = judge(motion, movable=movable, config=config)
+    state, confidence, evidence = state_of(track, voxels, names, config)
     keys = unpack(packed)
     positions = voxels.index(keys)
     there = positions >= 0
@@ -83,6 +83,20 @@ def describe(
         agreement=float(np.linalg.norm(track.feature_sum)) / max(track.weight, 1e-9) if contract == "dense" else 1.0,
         names=words,
     )
+
+
+def motion_of(track: Track, voxels: VoxelMap, config: StateConfig | None = None) -> Motion:
+    """Return a track's motion, with what other frames saw through of its first and its latest place."""
+    assert track.first is not None and track.last is not None, "a track has sightings"
+    keys = unpack(np.union1d(track.first.seen, track.last.seen))
+    return replace(track.motion(config), left=float((voxels.free.count(keys) > 0).mean()))
+
+
+def state_of(
+    track: Track, voxels: VoxelMap, names: Sequence[str], config: StateConfig | None = None
+) -> tuple[State, float, str]:
+    """Return a track's state, how sure it is, and what speaks for it."""
+    return judge(motion_of(track, voxels, config), movable=track.movable(names), config=config)
 
 
 def unpack_last(track: Track) -> Int64[np.ndarray, " n"]:

@@ -27,7 +27,7 @@ _WORDS = {
     Kind.GROUND: "road street lane driveable drivable surface asphalt pavement flat sidewalk terrain ground grass crosswalk "
     "parking floor lawn kerb curb path dirt gravel soil sand water",
     Kind.FIXED: "building house wall fence pole tree vegetation trunk bush hedge manmade barrier sign light cone shed bridge "
-    "structure plant bench lamp rail guardrail hydrant mailbox",
+    "structure others other plant bench lamp rail guardrail hydrant mailbox",
     Kind.MOVABLE: "car van truck bus trailer vehicle motorcycle motorbike bicycle bike pedestrian person people rider cyclist "
     "bicyclist motorcyclist tractor excavator train tram animal dog cat taxi ambulance lorry pickup scooter stroller",
     Kind.NOTHING: "sky free background void nothing",

@@ -9,6 +9,7 @@ import numpy as np
 
 from openvocab_occ.objects.bridges import cut_bridge
 from openvocab_occ.objects.kinds import Kind, kind_of
+from openvocab_occ.objects.segments import neighbour_pairs
 from openvocab_occ.objects.tracks import Track
 
 Pair = tuple[int, int]
@@ -24,6 +25,10 @@ class RefineConfig:
     """Cut tracks in which two things became one."""
     drop: bool = True
     """Drop tracks too thin to be things."""
+    touch: float = 0.3
+    """Touching tracks of one class that stands merge when their features are no further apart than this."""
+    contact: int = 2
+    """Pairs of neighbouring voxels from which tracks touch."""
     shared: float = 0.5
     """Tracks of one class merge when one segment covered both in this share of the sightings of the shorter."""
     min_voxels: int = 4
@@ -70,6 +75,8 @@ def refine(
     into: dict[int, int] = {}
     if config.merge:
         into = _merge(kept, together, apart, names, config)
+        touching = _merge_touching(kept, names, config)
+        into = {id: touching.get(home, home) for id, home in into.items()} | touching
         done = replace(done, merged=len(into))
     if config.split:
         done = replace(done, split=_split(kept, names))
@@ -114,6 +121,40 @@ def _merge(
         barred[a] |= barred[b]
         for other in barred[b]:
             barred[other].add(a)
+    return {id: home(id) for id in into}
+
+
+def _merge_touching(kept: dict[int, Track], names: Sequence[str], config: RefineConfig) -> dict[int, int]:
+    """Merge tracks of things that stand, of one class, that touch and look alike: pieces of a wall seen one by one."""
+    ids = [id for id in sorted(kept) if kind_of(class_of(kept[id], names)) == Kind.FIXED]
+    packed = [kept[id].voxels for id in ids]
+    if not ids:
+        return {}
+    owner = np.repeat(np.arange(len(ids)), [len(p) for p in packed])
+    keys = np.concatenate(packed)
+    order = np.lexsort((owner, keys))
+    keys, owner = keys[order], owner[order]
+    shared = np.flatnonzero(keys[1:] == keys[:-1])
+    contacts: Counter[Pair] = Counter(zip(owner[shared].tolist(), owner[shared + 1].tolist(), strict=True))
+    single = np.r_[True, keys[1:] != keys[:-1]]
+    keys, owner = keys[single], owner[single]
+    ends = owner[neighbour_pairs(keys)]
+    ends = np.sort(ends[ends[:, 0] != ends[:, 1]], axis=1)
+    contacts.update(zip(*ends.T.tolist(), strict=True))
+    into: dict[int, int] = {}
+
+    def home(id: int) -> int:
+        while id in into:
+            id = into[id]
+        return id
+
+    for (i, j), count in sorted(contacts.items(), key=lambda item: (-item[1], item[0])):
+        a, b = sorted((home(ids[i]), home(ids[j])))
+        if a == b or count < config.contact or class_of(kept[a], names) != class_of(kept[b], names):
+            continue
+        if 1 - float(kept[a].feature @ kept[b].feature) <= config.touch:
+            kept[a].absorb(kept.pop(b))
+            into[b] = a
     return {id: home(id) for id in into}
 
 

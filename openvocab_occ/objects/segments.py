@@ -38,6 +38,9 @@ class SegmentConfig:
     join: float = 0.75
     """Touching components of one class whose mean features are no further apart than this are one: a wall is one wall
     though its windows differ. Of things that can move any distance will do: cab and box are one truck."""
+    gap: int = 3
+    """Voxels along any axis between neighbours in an image that still touch: far surfaces are hit here and there only.
+    Of things that can move one less, for those park close."""
     reach: int = 24
     """Voxels between a hidden voxel and what is seen of its thing, at most."""
     cut: float = 0.9
@@ -156,7 +159,7 @@ def _components(
     movable: np.ndarray,
 ) -> Int64[np.ndarray, " n"]:
     """Return each voxel's component, -1 for hidden ones that belong to nothing seen."""
-    pairs = neighbour_pairs(packed)
+    pairs = np.concatenate([neighbour_pairs(packed), _image_pairs(packed, classes, row, frame, config, movable)])
     a, b = pairs.T
     named = (classes[a] != NO_LABEL) & (classes[b] != NO_LABEL)
     same = named & (classes[a] == classes[b])
@@ -175,6 +178,33 @@ def _components(
     kernels.flood(pairs, same, config.reach, component)
     touching = same & (component[a] >= 0) & (component[b] >= 0) & (component[a] != component[b])
     return _joined(component, pairs[touching], classes, row, frame, config, movable)
+
+
+def _image_pairs(
+    packed: Int64[np.ndarray, " n"],
+    classes: np.ndarray,
+    row: Int64[np.ndarray, " n"],
+    frame: FrameVoxels,
+    config: SegmentConfig,
+    movable: np.ndarray,
+) -> Int64[np.ndarray, "p 2"]:
+    """Return pairs of voxels of one class that are neighbours in an image with no depth edge between, but do not touch."""
+    place = np.full(len(frame.seen) + 1, -1, dtype=np.int64)  # the last stands for pixels that see nothing
+    place[row[row >= 0]] = np.flatnonzero(row >= 0)
+    codes = []
+    for view in frame.views:
+        image = place[view.rows]
+        for a, b in ((image[:, 1:], image[:, :-1]), (image[1:], image[:-1])):
+            edge = (a != b) & (a >= 0) & (b >= 0)
+            a, b = a[edge], b[edge]
+            codes.append(np.minimum(a, b) * len(packed) + np.maximum(a, b))
+    code = np.unique(np.concatenate([np.empty(0, np.int64), *codes]))
+    pairs = np.stack([code // max(len(packed), 1), code % max(len(packed), 1)], axis=1)
+    keys = unpack(packed)
+    off = np.abs(keys[pairs[:, 0]] - keys[pairs[:, 1]]).max(axis=1)
+    a, b = classes[pairs].T
+    keep = (a == b) & (off > 1) & (off <= config.gap - movable[a])
+    return np.ascontiguousarray(pairs[keep])
 
 
 def _joined(

@@ -28,6 +28,10 @@ class StateConfig:
     """Metres: a lesser span still counts as motion when it is a steady way at `speed` or more."""
     speed: float = 0.5
     """Metres a second below which a thing stands: the jitter of boxes that people draw."""
+    left: float = 0.3
+    """Least share of its places that other frames must have seen through before a thing counts as moved."""
+    surely: float = 12.0
+    """Metres: more than this no thing seen in pieces seems to move; what was seen through is not asked then."""
     min_time: float = 1.5
     """Seconds a thing must be observed before anything but motion is said of it."""
     recent: float = 1.2
@@ -36,7 +40,7 @@ class StateConfig:
     """Voxels: standard deviation of a bound."""
 
     def __post_init__(self) -> None:
-        for name in ("extent", "clear_extent", "speed", "min_time", "recent", "position_sigma"):
+        for name in ("extent", "clear_extent", "speed", "left", "surely", "min_time", "recent", "position_sigma"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise ConfigError(f"state option {name} is not usable", expected=">= 0", got=getattr(self, name))
 
@@ -59,6 +63,9 @@ class Motion:
     """Seconds from the first to the last sighting."""
     sightings: int
     """Frames it was seen in."""
+    left: float = 1.0
+    """Share of the voxels of its first and latest sighting that other frames saw through: what moved left its place, and
+    its new place was empty before. 1 where nobody looked."""
 
 
 def shift(
@@ -127,7 +134,8 @@ def judge(
     span = f"moved {motion.extent:.1f} +- {motion.sigma:.1f} m"
     far = motion.extent >= config.extent
     clear = motion.extent >= max(config.clear_extent, 3 * motion.sigma) and motion.mean_speed >= config.speed
-    if (far or clear) and not fixed:
+    gone = motion.left >= config.left or motion.extent >= config.surely
+    if (far or clear) and gone and not fixed:
         sure = 1 - float(np.exp(-motion.extent / max(3 * motion.sigma, 1e-9)))
         state = "moving" if motion.speed >= config.speed else "stopped"
         return state, sure, f"{span}, last at {motion.speed:.1f} m/s; {seen}"

@@ -87,7 +87,9 @@ class Tracker:
             whole = segments[numbers[0]]
             for number in numbers[1:]:
                 whole = joined(whole, segments[number])
-            self.tracks[id].add(whole, frame, time)
+            track = self.tracks[id]
+            track.stands = not self._may_move(track.class_votes + whole.class_votes)
+            track.add(whole, frame, time)
             self._enter(self.tracks[id])
         for number, found in enumerate(ids):
             if found == 0:
@@ -197,7 +199,9 @@ class Tracker:
 
     def _birth(self, segment: Segment, frame: int, time: float) -> int:
         id, self._next = self._next, self._next + 1
-        self.tracks[id] = Track.born(id, segment, frame, time, self._voxel_size)
+        self.tracks[id] = Track.born(
+            id, self._voxel_size, segment, frame=frame, time=time, stands=not self._may_move(segment.class_votes)
+        )
         self._enter(self.tracks[id])
         return id
 

@@ -39,6 +39,7 @@ class Track:
     crops: list[Crop] = field(default_factory=list[Crop])
     cells: set[int] = field(default_factory=set[int])
     """Coarse cells of its body, as the tracker's index holds them."""
+    first: Segment | None = None
     last: Segment | None = None
     last_time: float = -np.inf
     previous: tuple[float, Float64[np.ndarray, " 2"], Float64[np.ndarray, " 2"]] | None = None
@@ -46,15 +47,19 @@ class Track:
     """Of the motion model, metres a second."""
     moved: bool = False
     """True once it moved further than sightings err; its older voxels are then a trail, not the thing."""
+    stands: bool = False
+    """True while the class evidence says that such a thing cannot move."""
     bodies: list[Int64[np.ndarray, " n"]] = field(default_factory=list[np.ndarray])
     """Packed keys, hidden ones included, of its latest sightings that show where it ends."""
     _pieces: list[Int64[np.ndarray, " n"]] = field(default_factory=list[np.ndarray])
     _compacted: int = 0
 
     @classmethod
-    def born(cls, id: int, segment: Segment, frame: int, time: float, voxel_size: float) -> "Track":
+    def born(cls, id: int, voxel_size: float, segment: Segment, *, frame: int, time: float, stands: bool) -> "Track":
         """Begin with one segment."""
-        track = cls(id, voxel_size, np.zeros_like(segment.feature_sum), np.zeros_like(segment.class_votes))
+        track = cls(
+            id, voxel_size, np.zeros_like(segment.feature_sum), np.zeros_like(segment.class_votes), stands=stands
+        )
         track.add(segment, frame, time)
         return track
 
@@ -63,16 +68,15 @@ class Track:
         self._add_evidence(segment)
         if not segment.cut_off:
             self._measure(segment, time)
+        if self.first is None or time < min(self.times):
+            self.first = segment
         self.frames.append(frame)
         self.times.append(time)
         if time >= self.last_time:
             self.last, self.last_time = segment, time
-            if self.moved:
-                self._pieces, self._compacted = [], 0
             if not segment.cut_off or not self.bodies:
                 self.bodies = [*self.bodies, segment.body][-_BODIES:]
-        if self.last is segment or not self.moved:
-            self._pieces.append(segment.seen)
+        self._pieces.append(segment.seen)
         self._compact()
 
     def absorb(self, other: "Track") -> None:
@@ -81,6 +85,8 @@ class Track:
         self.class_votes = self.class_votes + other.class_votes
         self.weight += other.weight
         self.agreement_sum += other.agreement_sum
+        if min(other.times) < min(self.times):
+            self.first = other.first
         order = np.argsort(self.times + other.times, kind="stable")
         frames, times = self.frames + other.frames, self.times + other.times
         merged = {frames[i]: times[i] for i in order}
@@ -94,12 +100,13 @@ class Track:
         self.bounds = [bounds[time] for time in self.bound_times]
         self._keep_crops(other.crops)
         self.cells = self.cells | other.cells
-        self.moved = self.moved or other.moved
+        self.stands = self.stands and other.stands
+        self.moved = (self.moved or other.moved) and not self.stands
         if other.last is not None and (self.last is None or other.last_time > self.last_time):
             self.last, self.last_time = other.last, other.last_time
             self.velocity = other.velocity
             self.bodies = other.bodies
-        self._pieces = [self.last.seen] if self.moved and self.last is not None else self._pieces + other._pieces
+        self._pieces = self._pieces + other._pieces
         self._compacted = 0
 
     def of_voxels(self, packed: Int64[np.ndarray, " n"], id: int) -> "Track":
@@ -112,7 +119,9 @@ class Track:
 
     @property
     def voxels(self) -> Int64[np.ndarray, " n"]:
-        """Packed keys of its voxels: all that were seen of a thing that stands, the latest of one that moves."""
+        """Packed keys of its voxels: all that were seen of a thing that stands, the latest of one that moved."""
+        if self.moved and self.last is not None:
+            return self.last.seen
         self._compact(force=True)
         return self._pieces[0]
 
@@ -175,7 +184,8 @@ class Track:
             self.bounds, self.bound_times = self.bounds[::2], self.bound_times[::2]
         first = self.bounds[0]
         way = shift(first[:2], first[2:], low, high)
-        self.moved = self.moved or float(np.linalg.norm(way)) > max(1.0, 2.0 * self.voxel_size)
+        far = float(np.linalg.norm(way)) > max(1.0, 2.0 * self.voxel_size)
+        self.moved = (self.moved or far) and not self.stands
 
     def _keep_crops(self, crops: Iterable[Crop]) -> None:
         ranked = sorted([*self.crops, *crops], key=lambda c: (-c.score, c.frame, c.view))

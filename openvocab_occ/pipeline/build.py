@@ -194,6 +194,11 @@ class MapBuilder:
         self._frames.append(KeyFrame(frame.index, frame.timestamp, frame.T_world_ego, cameras))
 
     @property
+    def voxel_size(self) -> float:
+        """Metres; DEFAULT_VOXEL_SIZE before the first frame where none was asked for."""
+        return self._size(None)
+
+    @property
     def objects(self) -> ObjectBuilder | None:
         """What follows the things of the drive; None before the first frame."""
         return self._objects
