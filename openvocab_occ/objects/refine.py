@@ -8,9 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from openvocab_occ.objects.bridges import cut_bridge
-from openvocab_occ.objects.kinds import Kind, kind_of
+from openvocab_occ.mapping.keys import unpack
+from openvocab_occ.objects.box import principal_yaw
+from openvocab_occ.objects.kinds import Kind, kind_of, plausible_length
 from openvocab_occ.objects.segments import neighbour_pairs
-from openvocab_occ.objects.tracks import Track
+from openvocab_occ.objects.tracks import Track, coarse
 
 Pair = tuple[int, int]
 
@@ -29,6 +31,8 @@ class RefineConfig:
     """Touching tracks of one class that stands merge when their features are no further apart than this."""
     contact: int = 2
     """Pairs of neighbouring voxels from which tracks touch."""
+    crumb: int = 20
+    """Voxels below which a piece of what stands need not quite touch what it is a piece of."""
     shared: float = 0.5
     """Tracks of one class merge when one segment covered both in this share of the sightings of the shorter."""
     min_voxels: int = 4
@@ -125,22 +129,11 @@ def _merge(
 
 
 def _merge_touching(kept: dict[int, Track], names: Sequence[str], config: RefineConfig) -> dict[int, int]:
-    """Merge tracks of things that stand, of one class, that touch and look alike: pieces of a wall seen one by one."""
-    ids = [id for id in sorted(kept) if kind_of(class_of(kept[id], names)) == Kind.FIXED]
-    packed = [kept[id].voxels for id in ids]
-    if not ids:
-        return {}
-    owner = np.repeat(np.arange(len(ids)), [len(p) for p in packed])
-    keys = np.concatenate(packed)
-    order = np.lexsort((owner, keys))
-    keys, owner = keys[order], owner[order]
-    shared = np.flatnonzero(keys[1:] == keys[:-1])
-    contacts: Counter[Pair] = Counter(zip(owner[shared].tolist(), owner[shared + 1].tolist(), strict=True))
-    single = np.r_[True, keys[1:] != keys[:-1]]
-    keys, owner = keys[single], owner[single]
-    ends = owner[neighbour_pairs(keys)]
-    ends = np.sort(ends[ends[:, 0] != ends[:, 1]], axis=1)
-    contacts.update(zip(*ends.T.tolist(), strict=True))
+    """Merge pieces, of one class, of things that stand: of a wall seen bit by bit, of a bus behind trees.
+
+    Pieces of what cannot move merge when they touch, or crumbs nearly do, and look alike. Pieces of what can move need not touch quite, nor
+    look alike, for front and side of a truck differ; but together they must be no longer than such a thing can be.
+    """
     into: dict[int, int] = {}
 
     def home(id: int) -> int:
@@ -148,14 +141,56 @@ def _merge_touching(kept: dict[int, Track], names: Sequence[str], config: Refine
             id = into[id]
         return id
 
-    for (i, j), count in sorted(contacts.items(), key=lambda item: (-item[1], item[0])):
-        a, b = sorted((home(ids[i]), home(ids[j])))
-        if a == b or count < config.contact or class_of(kept[a], names) != class_of(kept[b], names):
-            continue
-        if 1 - float(kept[a].feature @ kept[b].feature) <= config.touch:
-            kept[a].absorb(kept.pop(b))
-            into[b] = a
+    for kind, near in ((Kind.FIXED, False), (Kind.FIXED, True), (Kind.MOVABLE, True)):
+        movable = kind == Kind.MOVABLE
+        ids = [i for i in sorted(kept) if kind_of(class_of(kept[i], names)) == kind and not kept[i].moved]
+        contacts = _contacts([coarse(kept[i].voxels) if near else kept[i].voxels for i in ids])
+        for (i, j), count in sorted(contacts.items(), key=lambda item: (-item[1], item[0])):
+            a, b = sorted((home(ids[i]), home(ids[j])))
+            if a == b or class_of(kept[a], names) != class_of(kept[b], names):
+                continue
+            if movable:
+                one = _fits_one(kept[a], kept[b], class_of(kept[a], names))
+            else:
+                alike = 1 - float(kept[a].feature @ kept[b].feature) <= config.touch
+                small = min(len(kept[a].voxels), len(kept[b].voxels)) < config.crumb
+                one = alike and (small if near else count >= config.contact)
+            if one:
+                kept[a].absorb(kept.pop(b))
+                into[b] = a
     return {id: home(id) for id in into}
+
+
+def _contacts(packed: Sequence[np.ndarray]) -> Counter[Pair]:
+    """Count the voxels that two sets share, and those of one that touch one of the other."""
+    contacts: Counter[Pair] = Counter()
+    if not packed:
+        return contacts
+    owner = np.repeat(np.arange(len(packed)), [len(p) for p in packed])
+    keys = np.concatenate(packed)
+    order = np.lexsort((owner, keys))
+    keys, owner = keys[order], owner[order]
+    same = np.flatnonzero(keys[1:] == keys[:-1])
+    contacts.update(zip(owner[same].tolist(), owner[same + 1].tolist(), strict=True))
+    single = np.r_[True, keys[1:] != keys[:-1]] if len(keys) else np.empty(0, bool)
+    keys, owner = keys[single], owner[single]
+    ends = np.sort(owner[neighbour_pairs(keys)], axis=1)
+    ends = ends[ends[:, 0] != ends[:, 1]]
+    contacts.update(zip(ends[:, 0].tolist(), ends[:, 1].tolist(), strict=True))
+    return contacts
+
+
+def _fits_one(a: Track, b: Track, name: str) -> bool:
+    """Tell whether two pieces together are no longer and no wider than one thing called so."""
+    lengths = plausible_length(name)
+    if lengths is None:
+        return False
+    xy = (unpack(np.union1d(a.voxels, b.voxels))[:, :2] + 0.5) * a.voxel_size
+    yaw = principal_yaw(xy)
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    length, width = np.ptp(xy @ turn, axis=0) + a.voxel_size
+    slack = 2 * a.voxel_size
+    return bool(length <= lengths[1] + slack and width <= max(3.0, lengths[0]) + slack)
 
 
 def _split(kept: dict[int, Track], names: Sequence[str]) -> int:
