@@ -20,8 +20,10 @@ COMMANDS = {
     "city": Command("city:city", "write a made-up town, driven many times, as a nuScenes tree"),
     "map": Command("map:build", "turn a drive and an ONNX model into a map"),
     "find": Command("find:find", "ask a map for things in words"),
+    "objects": Command("objects:objects", "print the things of a map as a tree"),
     "view": Command("view:view", "show a map in the web browser"),
     "export": Command("export:export", "render a semantic view of a map for a person or a model"),
+    "eval objects": Command("eval_objects:objects", "judge objects by the truth of the demo city"),
     "eval keyframe": Command("evaluate:keyframe", "judge depth and answers by the LiDAR of a real keyframe"),
 }
 

@@ -112,48 +112,39 @@ def unit(vector: np.ndarray, contract: Contract) -> Float32[np.ndarray, " c"]:
 
 
 def fit_box(track: Track, packed: Int64[np.ndarray, " n"], heading: float | None = None) -> Box:
-    """Return the upright box of a thing: of the bodies that its latest sightings show, else of its voxels.
+    """Return the upright box of a thing: around its seen voxels, and the hidden ones that most sightings agree on.
 
-    Sides are medians over the sightings, for a lattice that turns with the ego makes each a little different. Of a
-    moving thing the latest sighting and its heading count.
+    Of a moving thing the latest sighting and its heading count. Length >= width.
     """
     size = track.voxel_size
-    bodies = track.bodies or [packed]
-    if heading is not None or track.moved:
-        bodies = bodies[-1:]
-    corners = [(unpack(body) + 0.5) * size for body in bodies]
-    yaw = heading if heading is not None else _yaw(corners, track, size)
+    bodies = track.bodies[-1:] if track.moved else track.bodies
+    keys, counts = np.unique(np.concatenate(bodies), return_counts=True) if bodies else (packed, np.ones(len(packed)))
+    points = (unpack(np.union1d(packed, keys[2 * counts > len(bodies)])) + 0.5) * size
+    yaw = heading if heading is not None else _yaw(np.unique(points[:, :2], axis=0), size)
     yaw = (yaw + np.pi / 2) % np.pi - np.pi / 2
     c, s = np.cos(yaw), np.sin(yaw)
     turn = np.array([[c, -s], [s, c]])
-    low, high = np.empty((len(corners), 3)), np.empty((len(corners), 3))
-    for i, points in enumerate(corners):
-        local = np.c_[points[:, :2] @ turn, points[:, 2]]
-        low[i], high[i] = local.min(axis=0) - size / 2, local.max(axis=0) + size / 2
-    lower, upper = np.median(low, axis=0), np.median(high, axis=0)
-    middle = (lower + upper) / 2
-    extent = upper - lower
-    center = np.r_[turn @ middle[:2], middle[2]]
+    local = np.c_[points[:, :2] @ turn, points[:, 2]]
+    lower, upper = local.min(axis=0) - size / 2, local.max(axis=0) + size / 2
+    middle, extent = (lower + upper) / 2, upper - lower
     if extent[1] > extent[0]:
         extent, yaw = extent[[1, 0, 2]], yaw - np.pi / 2 if yaw > 0 else yaw + np.pi / 2
-    return Box(center, extent, float(yaw))
+    return Box(np.r_[turn @ middle[:2], middle[2]], extent, float(yaw))
 
 
-def _yaw(corners: Sequence[Float64[np.ndarray, "n 3"]], track: Track, size: float) -> float:
-    """Return the angle whose rectangles around the sightings have the least area together.
+def _yaw(points: Float64[np.ndarray, "n 2"], size: float) -> float:
+    """Return the angle of the rectangle of least area; where the spread's own axis is hardly worse, that one.
 
-    Angles within a degree and a half of the spread's own axis are not told apart by whole voxels: it wins.
+    Whole voxels do not tell a few degrees apart, the spread of all points does.
     """
-    spread = principal_yaw(np.concatenate([p[:, :2] for p in corners]))
-    tried = np.unique(np.round(np.r_[np.arange(0.0, 90.0, 3.0), np.rad2deg(spread) % 90], 6))
-    flat = [np.unique(p[:, :2], axis=0) for p in corners]
+    spread = principal_yaw(points)
+    own = float(np.rad2deg(spread) % 90)
+    tried = np.unique(np.round(np.r_[np.arange(0.0, 90.0, 3.0), own], 6))
 
     def area(degrees: float) -> float:
         a = np.deg2rad(degrees)
         turn = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
-        return sum(float(np.prod(np.ptp(p @ turn, axis=0) + size * 0.5)) for p in flat)
+        return float(np.prod(np.ptp(points @ turn, axis=0) + size / 2))
 
-    areas = np.array([area(d) for d in tried])
-    own = area(float(np.rad2deg(spread) % 90))
-    best = int(areas.argmin())
-    return spread if own <= 1.05 * areas[best] else float(np.deg2rad(tried[best]))
+    areas = np.array([area(degrees) for degrees in tried])
+    return spread if area(own) <= 1.05 * areas.min() else float(np.deg2rad(tried[int(areas.argmin())]))

@@ -24,6 +24,7 @@ ROAD, SIDEWALK, GREEN, FLAT = 1, 2, 3, 4
 _CLOSING = 2.4  # metres: gaps in the road as wide as what stands on it
 _ARM = 2.4  # metres: a way off that is narrower is a drive, not a street
 _NEAR = 22.0  # metres from the trajectory within which junctions are told
+_BETWEEN = 20.0  # metres between junctions, at least
 _DIRECTIONS = 72
 
 
@@ -147,7 +148,7 @@ def find_junctions(ground: Ground, path: Float[np.ndarray, "n 2"]) -> list[Junct
         reach = float(width[tuple(cell)])
         counts = [len(ground.arms(center, reach + more)) for more in (4.0, 7.0)]
         votes[tuple(cell)] = min(counts) >= 3
-    blobs, count = label(binary_dilation(votes, np.ones((3, 3), bool), iterations=max(round(4.0 / size / 1), 1)))  # pyright: ignore
+    blobs, count = label(binary_dilation(votes, np.ones((3, 3), bool), iterations=max(round(4.0 / size), 1)))  # pyright: ignore[reportGeneralTypeIssues]
     found = []
     for number in range(1, count + 1):
         cells = np.argwhere(votes & (blobs == number))
@@ -158,7 +159,12 @@ def find_junctions(ground: Ground, path: Float[np.ndarray, "n 2"]) -> list[Junct
         if len(arms) >= 3:
             kind = junction_kind(arms)
             found.append(Junction((float(center[0]), float(center[1])), kind, tuple(arms), reach + 3.0))
-    return sorted(found, key=lambda j: j.center)
+    found.sort(key=lambda j: (-len(j.arms), -j.radius))
+    kept: list[Junction] = []
+    for junction in found:  # mouths of one junction are not junctions of their own
+        if all(np.hypot(*np.subtract(junction.center, other.center)) > _BETWEEN for other in kept):
+            kept.append(junction)
+    return sorted(kept, key=lambda j: j.center)
 
 
 def junction_kind(arms: Sequence[float]) -> JunctionKind:

@@ -103,7 +103,8 @@ def find_regions(voxels: VoxelMap, names: Sequence[str], path: Float[np.ndarray,
             what: RegionKind = "road segment" if kind == "road" else kind  # pyright: ignore[reportAssignmentType]
             if kind == "road" and tree is not None and ground.width[cells].max() > _LOT_WIDTH:
                 xy = (np.argwhere(cells) + ground.origin + 0.5) * size
-                what = "parking lot" if tree.query(xy)[0].min() > _ON_PATH else what
+                joins = any(np.linalg.norm(xy - j.center, axis=1).min() <= j.radius + 1.5 for j in junctions)
+                what = "parking lot" if tree.query(xy)[0].min() > _ON_PATH and not joins else what
             number[cells] = len(regions) + 1
             regions.append(Region(what, area))
     return Regions(ground, number, tuple(regions), _lanes(number, regions, junctions, size))

@@ -111,6 +111,21 @@ class ObjectTree:
         """Return the nodes of a level; none when the tree has no such level."""
         return tuple(node for node in self._nodes.values() if node.level == name)
 
+    def walk(self, id: int = 0) -> Iterator[tuple[int, SceneObject]]:
+        """Yield a node and all below it with their depth below it, each before its children."""
+        todo = [(0, id)]
+        while todo:
+            depth, here = todo.pop()
+            yield depth, self[here]
+            todo += [(depth + 1, child) for child in reversed(self[here].children)]
+
+    def region_of(self, id: int) -> SceneObject | None:
+        """Return the region a node is in; None for one in none."""
+        node: SceneObject | None = self[id]
+        while node is not None and node.level != REGION:
+            node = None if node.parent is None else self[node.parent]
+        return node
+
     def __len__(self) -> int:
         return len(self.level(OBJECT))
 
