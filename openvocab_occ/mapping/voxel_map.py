@@ -64,12 +64,12 @@ class VoxelMap:
     @property
     def keys(self) -> Int32[np.ndarray, "n 3"]:
         """Lattice indices, sorted by x, then y, then z."""
-        return self._cached("keys", lambda: unpack(self._packed))
+        return self._cached("keys", lambda: unpack(self._packed), always=True)
 
     @property
     def centers(self) -> Float64[np.ndarray, "n 3"]:
         """Centres in the world, metres."""
-        return self._cached("centers", lambda: (self.keys + 0.5) * self.voxel_size)
+        return self._cached("centers", lambda: (self.keys + 0.5) * self.voxel_size, always=True)
 
     @property
     def features(self) -> Float32[np.ndarray, "n c"]:

@@ -18,7 +18,7 @@ from jaxtyping import Float, Float32, Int64
 from openvocab_occ.errors import AlreadyExistsError, ConfigError, MapError, OpenVocabOccError, StorageError
 from openvocab_occ.io.files import PathLike, existing, sha256, written_folder
 from openvocab_occ.mapping import FreeSpace, VoxelMap
-from openvocab_occ.mapping.keys import pack, packable
+from openvocab_occ.mapping.keys import pack_axes, packable
 from openvocab_occ.objects.feature_table import feature_table
 from openvocab_occ.objects.map_rows import frame_table, frames_of, layer_table, layers_of, object_table, objects_of
 from openvocab_occ.objects.scene_map import EncoderInfo, Provenance, SceneMap
@@ -34,8 +34,8 @@ MAX_COSINE_ERROR = 0.01
 """How far a stored feature may be from the voxel's own, by default: a match of cosine 0.3 moves by at most 0.14, one of
 neighbours that share a vector by what they differ anyway."""
 HASHED_AT_ONCE = 1 << 28
-"""Bytes up to which a file is hashed when the map is opened (0.15 s); larger ones are by `verify_map` and, page by page,
-when they are read."""
+"""Bytes up to which a file is hashed when the map is opened (0.15 s); larger ones are by `verify_map` and, page by
+page, when they are read."""
 _ROW_GROUP = 1 << 16
 _AXES = ("x", "y", "z")
 _PARTS = {
@@ -249,14 +249,15 @@ def _voxels(
     size, name = float(manifest["voxel_size"]), "voxels.parquet"
     groups = None if region is None else _groups(folder / name, region, size)
     table = _table(folder, name, list(_AXES), groups)
-    keys = np.stack([table[axis].to_numpy() for axis in _AXES], axis=1).astype(np.int32)
-    packed = pack(keys)
-    if not packable(keys).all() or (np.diff(packed) <= 0).any():
-        raise MapError(f"voxel keys of map {folder} repeat, are too large or out of order", fix="rebuild the map")
+    axes = [table[axis].to_numpy().astype(np.int32, copy=False) for axis in _AXES]
+    packed = pack_axes(*axes)
+    ends = np.array([[a.min(initial=0), a.max(initial=0)] for a in axes], dtype=np.int32).T
+    if not packable(ends).all() or (packed[1:] <= packed[:-1]).any():
+        raise MapError("voxel keys repeat, are too large or out of order", got=folder, fix="rebuild the map")
     inside = None
     rows = np.arange(len(packed))
     if region is not None and groups is not None:
-        centers = (keys + 0.5) * size
+        centers = (np.stack(axes, axis=1) + 0.5) * size
         inside = ((centers >= region[0]) & (centers < region[1])).all(axis=1)
         with pq.ParquetFile(folder / name) as file:
             lengths = [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)]
