@@ -10,11 +10,11 @@ from jaxtyping import Float, Float32, Int, Int32
 from openvocab_occ._jit import in_slices
 from openvocab_occ.depth._sampling_kernels import first_samples, samples_from_entry
 from openvocab_occ.depth.image import DepthImage as DepthImage
-from openvocab_occ.depth.pixel_rays import PixelRays
 from openvocab_occ.depth.raster import can_raster, raster
 from openvocab_occ.errors import ConfigError
 from openvocab_occ.geometry import Camera
 from openvocab_occ.occupancy import OccupancyGrid
+from openvocab_occ.occupancy.pixel_rays import PixelRays
 from openvocab_occ.occupancy.rays import lattice_rays, trace_lattice
 
 _GRAIN = 2048  # rays worth a thread
