@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from openvocab_occ.occupancy.grid import OccupancyGrid as OccupancyGrid
     from openvocab_occ.occupancy.rays import RayHits as RayHits
     from openvocab_occ.occupancy.rays import cast_rays as cast_rays
+    from openvocab_occ.occupancy.visibility import visibility_mask as visibility_mask
     from openvocab_occ.pipeline.build import MapBuilder as MapBuilder
     from openvocab_occ.pipeline.build import build_map as build_map
     from openvocab_occ.query.find import Answer as Answer
@@ -64,6 +65,7 @@ _HOME = {
     "load_sequence": "openvocab_occ.datasets.registry",
     "render_depth": "openvocab_occ.depth.render",
     "view": "openvocab_occ.viewer.server",
+    "visibility_mask": "openvocab_occ.occupancy.visibility",
 }
 __all__ = [*_HOME]  # pyright: ignore[reportUnsupportedDunderAll]
 

@@ -23,6 +23,7 @@ COMMANDS = {
     "view": Command("view:view", "show a map in the web browser"),
     "export": Command("export:export", "render a semantic view of a map for a person or a model"),
     "eval keyframe": Command("evaluate:keyframe", "judge depth and answers by the LiDAR of a real keyframe"),
+    "bench depth": Command("bench:depth", "time depth images beside other ways to them"),
 }
 
 
