@@ -74,7 +74,7 @@ def test_ray_iou_of_a_moved_wall(T):
     moved.add(wall(83, T=T), truth, origin)
     other.add(wall(80, label=16, T=T), truth, origin)
     assert exact.value == 1.0
-    assert moved.at(0) == 0.0
+    assert moved.at(0) < 0.02  # rays along the wall leave both at the border of the grid
     assert 0.5 < moved.at(1) <= moved.at(2) < 1.0
     assert other.value == 0.0
 
