@@ -27,7 +27,7 @@ def seeded() -> None:
 
 @pytest.fixture(scope="module")
 def frame():
-    return load_sequence("city", frames=1)[0]
+    return load_sequence("street", frames=1)[0]
 
 
 @pytest.mark.parametrize(
