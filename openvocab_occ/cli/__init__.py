@@ -24,7 +24,15 @@ COMMANDS = {
     "view": Command("view:view", "show a map in the web browser"),
     "export": Command("export:export", "render a semantic view of a map for a person or a model"),
     "eval objects": Command("eval_objects:objects", "judge objects by the truth of the demo city"),
+    "file info": Command("file:info", "say what a map holds"),
+    "file verify": Command("file:verify", "check every byte of a map"),
+    "file merge": Command("file:merge", "merge two drives of one place"),
+    "file diff": Command("file:diff", "say what appeared, vanished or changed between two maps"),
+    "file crop": Command("file:crop", "cut a box out of a map"),
+    "file concat": Command("file:concat", "put maps that share no voxel together"),
+    "file convert": Command("file:convert", "write a map or points in another format"),
     "eval keyframe": Command("evaluate:keyframe", "judge depth and answers by the LiDAR of a real keyframe"),
+    "bench depth": Command("bench:depth", "time depth images beside other ways to them"),
 }
 
 

@@ -38,8 +38,8 @@ def load_sequence(
         load_sequence("city", seed=7, route=0, traversal=1, condition="rain", frames=8)
 
     Args:
-        kind: `nuscenes-infos` (mmdetection3d v1.1 info files), `city` (a made-up town; options `seed`, `route`, `traversal`,
-            `condition`, `frames`, `size`) or `street` (a small made-up street; options `seed`, `frames`).
+        kind: `nuscenes-infos` (mmdetection3d v1.1 info files), `city` (a made-up town; options `seed`, `route`,
+            `traversal`, `condition`, `frames`, `size`) or `street` (a small made-up street; options `seed`, `frames`).
         root: File or folder of the drive.
         scene: Which drive, where the root holds several.
         occupancy: Your own predictions: a file name with {token}, {index}, {scene} or {timestamp}, relative to the

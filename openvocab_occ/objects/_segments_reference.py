@@ -8,8 +8,8 @@ def merge_edges(pairs: np.ndarray, weights: np.ndarray, num_nodes: int, scale: f
     sets = [{node} for node in range(num_nodes)]
     edges = sorted(range(len(pairs)), key=lambda e: (weights[e], e))
 
-    def home(node: int) -> set[int]:
-        return next(s for s in sets if node in s)
+    def home(node: int | np.integer) -> set[int]:
+        return next(s for s in sets if int(node) in s)
 
     def heaviest(nodes: set[int]) -> float:
         """Internal difference: the heaviest edge among those accepted inside a component."""

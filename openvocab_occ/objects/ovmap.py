@@ -18,7 +18,7 @@ from jaxtyping import Float, Float32, Int64
 from openvocab_occ.errors import AlreadyExistsError, ConfigError, MapError, OpenVocabOccError, StorageError
 from openvocab_occ.io.files import PathLike, existing, sha256, written_folder
 from openvocab_occ.mapping import FreeSpace, VoxelMap
-from openvocab_occ.mapping.keys import pack, packable
+from openvocab_occ.mapping.keys import pack_axes, packable
 from openvocab_occ.objects.feature_table import feature_table
 from openvocab_occ.objects.map_rows import frame_table, frames_of, layer_table, layers_of, object_table, objects_of
 from openvocab_occ.objects.scene_map import EncoderInfo, Provenance, SceneMap
@@ -34,8 +34,8 @@ MAX_COSINE_ERROR = 0.01
 """How far a stored feature may be from the voxel's own, by default: a match of cosine 0.3 moves by at most 0.14, one of
 neighbours that share a vector by what they differ anyway."""
 HASHED_AT_ONCE = 1 << 28
-"""Bytes up to which a file is hashed when the map is opened (0.15 s); larger ones are by `verify_map` and, page by page,
-when they are read."""
+"""Bytes up to which a file is hashed when the map is opened (0.15 s); larger ones are by `verify_map` and, page by
+page, when they are read."""
 _ROW_GROUP = 1 << 16
 _AXES = ("x", "y", "z")
 _PARTS = {
@@ -211,7 +211,7 @@ def _table(folder: Path, name: str, columns: list[str] | None = None, groups: li
 def _write(table: pa.Table, path: Path) -> None:
     """Write a table; weights differ in every bit and are split by byte, what repeats is put in a dictionary."""
     split = [name for name in table.column_names if name in ("weight", "color_weight", "view_score", "agreement")]
-    others = [name for name in table.column_names if name not in split]
+    others: Any = [name for name in table.column_names if name not in split]
     pq.write_table(
         table, path, compression="zstd", compression_level=6, row_group_size=_ROW_GROUP, write_page_checksum=True,
         use_dictionary=others, column_encoding=dict.fromkeys(split, "BYTE_STREAM_SPLIT"),
@@ -244,24 +244,24 @@ def _space_table(space: FreeSpace) -> pa.Table:
 
 def _voxels(
     folder: Path, manifest: Mapping[str, Any], encoder: EncoderInfo, region: Float[np.ndarray, "2 3"] | None
-) -> tuple[VoxelMap, Int64[np.ndarray, " n"]]:
-    """Return the voxels, whose columns are read when asked for, and which rows of the file they are."""
+) -> tuple[VoxelMap, Int64[np.ndarray, " n"] | None]:
+    """Return the voxels, whose columns are read when asked for, and which rows of the file they are; None for all."""
     size, name = float(manifest["voxel_size"]), "voxels.parquet"
     groups = None if region is None else _groups(folder / name, region, size)
     table = _table(folder, name, list(_AXES), groups)
-    keys = np.stack([table[axis].to_numpy() for axis in _AXES], axis=1).astype(np.int32)
-    packed = pack(keys)
-    if not packable(keys).all() or (np.diff(packed) <= 0).any():
-        raise MapError(f"voxel keys of map {folder} repeat, are too large or out of order", fix="rebuild the map")
-    inside = None
-    rows = np.arange(len(packed))
+    axes = [table[axis].to_numpy().astype(np.int32, copy=False) for axis in _AXES]
+    packed = pack_axes(*axes)
+    ends = np.array([[a.min(initial=0), a.max(initial=0)] for a in axes], dtype=np.int32).T
+    if not packable(ends).all() or (packed[1:] <= packed[:-1]).any():
+        raise MapError("voxel keys repeat, are too large or out of order", got=folder, fix="rebuild the map")
+    inside = rows = None
     if region is not None and groups is not None:
-        centers = (keys + 0.5) * size
+        centers = (np.stack(axes, axis=1) + 0.5) * size
         inside = ((centers >= region[0]) & (centers < region[1])).all(axis=1)
         with pq.ParquetFile(folder / name) as file:
             lengths = [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)]
         first = np.cumsum([0, *lengths])
-        rows = np.concatenate([np.arange(first[g], first[g + 1]) for g in groups] or [rows])[inside]
+        rows = np.concatenate([np.arange(first[g], first[g + 1]) for g in groups] or [first[:0]])[inside]
         packed = packed[inside]
     read = _reader(folder, encoder.dim, groups, inside)
     classes = int(manifest["num_classes"])

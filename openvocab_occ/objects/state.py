@@ -69,11 +69,11 @@ class Motion:
 
 
 def shift(
-    low_a: Float64[np.ndarray, "*n 2"],
-    high_a: Float64[np.ndarray, "*n 2"],
-    low_b: Float64[np.ndarray, "*n 2"],
-    high_b: Float64[np.ndarray, "*n 2"],
-) -> Float64[np.ndarray, "*n 2"]:
+    low_a: Float64[np.ndarray, "*_ 2"],
+    high_a: Float64[np.ndarray, "*_ 2"],
+    low_b: Float64[np.ndarray, "*_ 2"],
+    high_b: Float64[np.ndarray, "*_ 2"],
+) -> Float64[np.ndarray, "*_ 2"]:
     """Return the least motion from bounds a to bounds b, metres along x and y; see the top of the file."""
     lower, upper = low_b - low_a, high_b - high_a
     least = np.where(np.abs(lower) < np.abs(upper), lower, upper)

@@ -108,7 +108,7 @@ def test_a_thing_across_two_cameras_is_one_segment_with_a_crop_in_each():
 
 
 def test_options_are_checked():
-    with pytest.raises(ConfigError, match=r"segment option scale is not usable: expected >= 0, got -1"):
-        SegmentConfig(scale=-1)
+    with pytest.raises(ConfigError, match=r"segment option scale is not usable: expected >= 0, got -1.0"):
+        SegmentConfig(scale=-1.0)
     with pytest.raises(ConfigError, match="min_voxels is not usable: expected at least 1, got 0"):
         SegmentConfig(min_voxels=0)

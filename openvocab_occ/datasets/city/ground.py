@@ -231,7 +231,9 @@ def _mark_lot(b: Builder, lot: Patch) -> None:
     for y0, y1 in ((7.4, 12.6), (-2.6, 2.6)):
         for x in np.arange(-15.4, 15.5, 2.8):
             corners = np.array([(x - 0.06, y0), (x + 0.06, y0), (x + 0.06, y1), (x - 0.06, y1)]) @ turn.T + middle
-            b.sheet(np.hstack([corners, np.full((4, 1), _PAINT)]), Surface(Material.MARKING, "#e9e7df"), Part.MARKING)
+            b.sheet(
+                list(np.hstack([corners, np.full((4, 1), _PAINT)])), Surface(Material.MARKING, "#e9e7df"), Part.MARKING
+            )
 
 
 def _mesh(corners: np.ndarray, uv: np.ndarray, surface: Surface, part: Part) -> Mesh:

@@ -150,7 +150,7 @@ def _walkers(town: Town, way: list[int], rng: np.random.Generator) -> tuple[list
             lead = float(rng.uniform(1.0, 2.6))
             point, heading = street.at(s, side * (street.half_width + lead))
             walkers.append(
-                Crosser((float(point[0]), float(point[1])), float(heading) - side * np.pi / 2, float(rng.uniform(1.1, 1.5)),
-                        lead, 2 * street.half_width)
+                Crosser((float(point[0]), float(point[1])), float(heading) - side * np.pi / 2,
+                        float(rng.uniform(1.1, 1.5)), lead, 2 * street.half_width)
             )  # fmt: skip
     return walkers, [(int(rng.integers(1 << 16)), COLORS[rng.integers(len(COLORS))]) for _ in walkers]

@@ -1,7 +1,7 @@
 """Who moves: cars follow lanes and each other, wait at junctions, crossings and stops; people walk and cross.
 
-A simulation in steps of a tenth of a second; the ego takes part in it like any other vehicle. Following is the intelligent
-driver model (Treiber, Hennecke, Helbing 2000).
+A simulation in steps of a tenth of a second; the ego takes part in it like any other vehicle. Following is the
+intelligent driver model (Treiber, Hennecke, Helbing 2000).
 """
 
 from collections.abc import Sequence
