@@ -52,7 +52,7 @@ def _idf1(frames: Sequence[Sight], threshold: float = 0.5) -> float:
 
 
 def _hota(frames: Sequence[Sight]) -> float:
-    """Return HOTA over all thresholds, matched as its authors' code does: by similarity, weighed by global alignment."""
+    """Return HOTA over all thresholds, matched as its authors do: by similarity, weighed by global alignment."""
     true, predicted = Counter[int](), Counter[int]()
     potential: defaultdict[tuple[int, int], float] = defaultdict(float)
     for frame in frames:

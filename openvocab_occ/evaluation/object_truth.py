@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Int32
@@ -27,6 +27,7 @@ class TrueThing:
     """Of things with a box; its yaw points forward for things that have a front."""
 
 
+@runtime_checkable
 class Truth(Protocol):
     """The truth of one drive."""
 

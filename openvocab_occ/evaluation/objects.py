@@ -26,7 +26,7 @@ from openvocab_occ.objects.scene_map import SceneMap
 from openvocab_occ.objects.state import Motion, StateConfig, judge
 from openvocab_occ.objects.tree import SceneObject
 from openvocab_occ.pipeline.build import MapBuilder
-from openvocab_occ.segmentation.encoder import FeatureMap, PixelEncoder
+from openvocab_occ.segmentation.encoder import Contract, FeatureMap, PixelEncoder, TextEncoder
 
 MIN_VOXELS = 10
 """Things of which fewer voxels were seen are neither missed nor hit."""
@@ -106,7 +106,9 @@ class _Record:
     def add(self, frame: Frame, truth: Truth, builder: MapBuilder) -> None:
         """Note a frame after the builder has seen it."""
         grid, objects = frame.occupancy, builder.objects
-        assert grid is not None and objects is not None and objects.latest is not None, "built from grids"
+        assert grid is not None, "built from grids"
+        assert objects is not None, "a frame was integrated"
+        assert objects.latest is not None, "a frame was integrated"
         instances = truth.instances(frame).reshape(-1)
         flat = np.flatnonzero(instances)
         size = builder.voxel_size
@@ -184,9 +186,7 @@ class _Record:
             iou, share = overlaps([whole[id] for id in mine], [true[id] for id in names])
             counted = np.array([len(true[id]) >= MIN_VOXELS and id in self.things for id in names], dtype=bool)
             keep = (share[:, counted].sum(axis=1) >= 0.5) | (iou[:, counted].max(axis=1, initial=0.0) >= 0.5)
-            pairs = {
-                (names[t], mine[p]): float(iou[p, t]) for p, t in np.argwhere(iou > 0) if counted[t] and keep[p]
-            }
+            pairs = {(names[t], mine[p]): float(iou[p, t]) for p, t in np.argwhere(iou > 0) if counted[t] and keep[p]}
             sights.append(Sight(
                 tuple(id for id, c in zip(names, counted, strict=True) if c),
                 tuple(id for id, k in zip(mine, keep, strict=True) if k), pairs,
@@ -251,7 +251,10 @@ def _pairs(iou: np.ndarray, counted: Sequence[int], threshold: float = 0.25) -> 
 class TruthEncoder:
     """Stands in for a network: each pixel gets the vector of the true thing that depth says it sees."""
 
-    contract, labels, text, name = "dense", (), None, "truth"
+    contract: Contract = "dense"
+    labels: tuple[str, ...] = ()
+    text: TextEncoder | None = None
+    name = "truth"
     fingerprint = "truth" * 12
 
     def __init__(self, dim: int = 24) -> None:

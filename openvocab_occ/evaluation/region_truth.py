@@ -48,9 +48,7 @@ def score_regions(scene: SceneMap, plan: Plan) -> RegionScores:
         len(centers) == 0 or np.linalg.norm(centers - np.array(j.center), axis=1).min() > 20.0
         for j in regions.lanes.junctions
     )
-    return RegionScores(
-        purity=purity(regions, plan), junctions=len(passed), found=found, right=right, extra=int(extra)
-    )
+    return RegionScores(purity=purity(regions, plan), junctions=len(passed), found=found, right=right, extra=int(extra))
 
 
 def purity(regions: Regions, plan: Plan) -> float:

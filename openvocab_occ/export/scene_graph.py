@@ -135,6 +135,7 @@ def write_geojson(scene: SceneMap, path: PathLike, reference: GeoReference | Non
 def write_gltf(objects: Iterable[SceneObject], path: PathLike) -> Path:
     """Write the boxes of objects, coloured by state, as a binary glTF file (`.glb`), y up as glTF wants it."""
     import trimesh
+    from trimesh.visual import ColorVisuals
 
     target = Path(path)
     if target.suffix != ".glb":
@@ -145,7 +146,8 @@ def write_gltf(objects: Iterable[SceneObject], path: PathLike) -> Path:
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = node.box.axes, node.center
         mesh = trimesh.creation.box(extents=np.maximum(node.box.size, 1e-3), transform=turn @ T)
-        mesh.visual.face_colors = (*_COLORS.get(node.state, _COLORS["unknown"]), 255)
+        color = (*_COLORS.get(node.state, _COLORS["unknown"]), 255)
+        mesh.visual = ColorVisuals(mesh, face_colors=color)
         name = f"{node.id} {node.label}"
         scene.add_geometry(mesh, node_name=name, geom_name=name)
     if not scene.geometry:

@@ -13,7 +13,7 @@ def merge_edges(pairs: np.ndarray, weights: np.ndarray, num_nodes: int, scale: f
 
     def heaviest(nodes: set[int]) -> float:
         """Internal difference: the heaviest edge among those accepted inside a component."""
-        return max((weights[e] for e in accepted if pairs[e][0] in nodes), default=0.0)
+        return max((float(weights[e]) for e in accepted if pairs[e][0] in nodes), default=0.0)
 
     accepted: list[int] = []
     for small in (False, True):

@@ -113,5 +113,3 @@ def claimed(objects: Sequence[SceneObject], voxels: VoxelMap) -> np.ndarray:
     for item in objects:
         taken[item.voxels] = True
     return taken
-
-

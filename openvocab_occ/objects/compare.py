@@ -74,7 +74,7 @@ def match_objects(a: SceneMap, b: SceneMap) -> list[tuple[int, int]]:
 
 
 def merge_objects(a: SceneMap, b: SceneMap) -> dict[int, int]:
-    """Return the id each node of b's tree gets when it is merged into a's: a's where they match, else one not used yet."""
+    """Return the id that each node of b's tree gets when merged into a's: a's where they match, else a fresh one."""
     ids = {j: i for i, j in match_objects(a, b)} | {0: 0}
     fresh = max(node.id for node in a.objects.nodes) + 1
     for node in sorted(b.objects.nodes, key=lambda node: node.id):
@@ -119,7 +119,7 @@ def _scores(mine: Sequence[SceneObject], yours: Sequence[SceneObject], size: flo
             holders.setdefault(cell, []).append(column)
     for row, here in enumerate(cells[0]):
         counts = np.bincount([c for cell in here.tolist() for c in holders.get(cell, ())], minlength=len(yours))
-        for column in np.flatnonzero(counts):
+        for column in np.flatnonzero(counts).tolist():
             shared = counts[column] / min(len(here), len(cells[1][column]))
             p, q = mine[row].embedding, yours[column].embedding
             like = float(p @ q) / max(float(np.linalg.norm(p) * np.linalg.norm(q)), 1e-12)

@@ -87,7 +87,8 @@ def describe(
 
 def motion_of(track: Track, voxels: VoxelMap, config: StateConfig | None = None) -> Motion:
     """Return a track's motion, with what other frames saw through of its first and its latest place."""
-    assert track.first is not None and track.last is not None, "a track has sightings"
+    assert track.first is not None, "a track has sightings"
+    assert track.last is not None, "a track has sightings"
     keys = unpack(np.union1d(track.first.seen, track.last.seen))
     return replace(track.motion(config), left=float((voxels.free.count(keys) > 0).mean()))
 

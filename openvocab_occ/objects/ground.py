@@ -100,7 +100,9 @@ class Ground:
         wide = np.pad(self.classes == ROAD, steps + 1)
         closed = binary_closing(wide, np.ones((3, 3), bool), iterations=steps)
         other = np.pad(np.isin(self.classes, (SIDEWALK, GREEN)), steps + 1)
-        opened = binary_opening(closed & ~other, np.ones((3, 3), bool), iterations=max(steps // 2, 1))
+        opened = binary_opening(
+            np.asarray(closed, dtype=np.bool_) & ~other, np.ones((3, 3), bool), iterations=max(steps // 2, 1)
+        )
         return opened[steps + 1 : -steps - 1, steps + 1 : -steps - 1]
 
     @cached_property
@@ -135,14 +137,14 @@ def find_junctions(ground: Ground, path: Float[np.ndarray, "n 2"]) -> list[Junct
     lie together are one junction; its centre is where the road is widest.
     """
     from scipy.ndimage import binary_dilation, label, maximum_filter
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     if not len(path) or not ground.road.any():
         return []
     width, size = ground.width, ground.voxel_size
     middle = np.argwhere((width >= maximum_filter(width, 5)) & (width > 1.5))
     xy = (middle + ground.origin + 0.5) * size
-    near = cKDTree(path).query(xy)[0] <= _NEAR if len(xy) else np.empty(0, bool)
+    near = KDTree(path).query(xy)[0] <= _NEAR if len(xy) else np.empty(0, bool)
     votes = np.zeros(width.shape, dtype=bool)
     for cell, center in zip(middle[near], xy[near], strict=True):
         reach = float(width[tuple(cell)])

@@ -46,12 +46,12 @@ def _chains(objects: Sequence[SceneObject], gap: float, *, aligned: bool) -> lis
     """Return the objects linked by gaps (single linkage)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     if len(objects) < 2:
         return []
     reach = max(float(o.box.size[:2].max()) for o in objects) + gap
-    pairs = cKDTree(np.array([o.center[:2] for o in objects])).query_pairs(reach, output_type="ndarray")
+    pairs = KDTree(np.array([o.center[:2] for o in objects])).query_pairs(reach, output_type="ndarray")
     links = [(i, j) for i, j in pairs if _linked(objects[i], objects[j], gap, aligned)]
     ends = np.array(links, dtype=int).reshape(-1, 2)
     graph = coo_array((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(len(objects),) * 2)

@@ -83,7 +83,7 @@ class _Nodes:
         return node.id
 
     def of_voxels(self, level: str, label: str, members: Int64[np.ndarray, " n"], parent: int) -> SceneObject:
-        """Return a node of voxels of the map; without a label it is called by the best channel or class of its voxels."""
+        """Return a node of voxels of the map; without a label their best channel or class names it."""
         voxels = self.voxels
         embedding = voxels.features[members].mean(axis=0, dtype=np.float64)
         score = 1.0
@@ -208,8 +208,9 @@ class Dendrogram:
     leaves: tuple[int, ...]
     """Ids of the nodes without children."""
     linkage: Float64[np.ndarray, "m 4"]
-    """As SciPy's: two clusters, the height at which they merge, the leaves of both. Merges inside an object lie in (0, 1],
-    inside a group in (1, 2], inside a region in (2, 3], inside the scene in (3, 4]; lower ones are more alike."""
+    """As SciPy's: two clusters, the height at which they merge, the leaves of both. Merges inside an object lie in
+    (0, 1], inside a group in (1, 2], inside a region in (2, 3], inside the scene in (3, 4]; lower ones
+    are more alike."""
 
     def cut(self, level: str) -> dict[int, int]:
         """Return the cluster of each leaf when cut at the height of a level: two of a node of that level share one."""

@@ -1,7 +1,7 @@
 """What kind of thing a class name speaks of: ground, something fixed, or something that can move.
 
-This is evidence for cutting, tracking and states where an occupancy grid or a labelled model names classes; it is never a
-list of what can be found.
+This is evidence for cutting, tracking and states where an occupancy grid or a labelled model names classes; it is never
+a list of what can be found.
 """
 
 import re
@@ -24,12 +24,13 @@ class Kind(IntEnum):
 
 
 _WORDS = {
-    Kind.GROUND: "road street lane driveable drivable surface asphalt pavement flat sidewalk terrain ground grass crosswalk "
-    "parking floor lawn kerb curb path dirt gravel soil sand water",
-    Kind.FIXED: "building house wall fence pole tree vegetation trunk bush hedge manmade barrier sign light cone shed bridge "
-    "structure others other plant bench lamp rail guardrail hydrant mailbox",
-    Kind.MOVABLE: "car van truck bus trailer vehicle motorcycle motorbike bicycle bike pedestrian person people rider cyclist "
-    "bicyclist motorcyclist tractor excavator train tram animal dog cat taxi ambulance lorry pickup scooter stroller",
+    Kind.GROUND: "road street lane driveable drivable surface asphalt pavement flat sidewalk terrain ground grass "
+    "crosswalk parking floor lawn kerb curb path dirt gravel soil sand water",
+    Kind.FIXED: "building house wall fence pole tree vegetation trunk bush hedge manmade barrier sign light cone "
+    "shed bridge structure others other plant bench lamp rail guardrail hydrant mailbox",
+    Kind.MOVABLE: "car van truck bus trailer vehicle motorcycle motorbike bicycle bike pedestrian person people "
+    "rider cyclist bicyclist motorcyclist tractor excavator train tram animal dog cat taxi ambulance "
+    "lorry pickup scooter stroller",
     Kind.NOTHING: "sky free background void nothing",
 }  # fmt: skip
 _KIND = {word: kind for kind, words in _WORDS.items() for word in words.split()}
@@ -42,7 +43,7 @@ _LENGTH = {
 
 
 def kind_of(name: str) -> Kind:
-    """Return what kind of thing a class name speaks of, by its words; the last known word decides ("car park" is ground).
+    """Return what kind of thing a class name speaks of, by its words; the last known word decides.
 
     Names of which no word is known are UNKNOWN.
     """

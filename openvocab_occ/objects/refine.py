@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from openvocab_occ.objects.bridges import cut_bridge
 from openvocab_occ.mapping.keys import unpack
 from openvocab_occ.objects.box import principal_yaw
+from openvocab_occ.objects.bridges import cut_bridge
 from openvocab_occ.objects.kinds import Kind, kind_of, plausible_length
 from openvocab_occ.objects.segments import neighbour_pairs
 from openvocab_occ.objects.tracks import Track, coarse
@@ -131,8 +131,9 @@ def _merge(
 def _merge_touching(kept: dict[int, Track], names: Sequence[str], config: RefineConfig) -> dict[int, int]:
     """Merge pieces, of one class, of things that stand: of a wall seen bit by bit, of a bus behind trees.
 
-    Pieces of what cannot move merge when they touch, or crumbs nearly do, and look alike. Pieces of what can move need not touch quite, nor
-    look alike, for front and side of a truck differ; but together they must be no longer than such a thing can be.
+    Pieces of what cannot move merge when they touch, or crumbs nearly do, and look alike. Pieces of what can
+    move need not touch quite, nor look alike, for front and side of a truck differ; but together they must be no longer
+    than such a thing can be.
     """
     into: dict[int, int] = {}
 

@@ -1,4 +1,4 @@
-"""Regions of a scene: stretches of road, junctions, parking lots, sidewalks, greens; and the lane graph of the roads."""
+"""Regions of a scene: stretches of road, junctions, lots, sidewalks, greens; and the lane graph of the roads."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -76,7 +76,7 @@ def find_regions(voxels: VoxelMap, names: Sequence[str], path: Float[np.ndarray,
         path: Where the ego drove, metres along x and y; junctions and roads are told near it.
     """
     from scipy.ndimage import label
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     ground = Ground.of(voxels, names)
     size = ground.voxel_size
@@ -90,7 +90,7 @@ def find_regions(voxels: VoxelMap, names: Sequence[str], path: Float[np.ndarray,
         number[disc & road] = len(regions) + 1
         regions.append(Region("junction", float((disc & road).sum()) * size**2, junction))
         road &= ~disc
-    tree = cKDTree(path) if len(path) else None
+    tree = KDTree(path) if len(path) else None
     rest = [(road, "road"), *((ground.classes == c, k) for c, k in
             ((SIDEWALK, "sidewalk"), (GREEN, "green"), (FLAT, "other ground")))]  # fmt: skip
     for mask, kind in rest:
@@ -121,7 +121,7 @@ def _lanes(number: np.ndarray, regions: Sequence[Region], junctions: Sequence[Ju
         if region.kind != "road segment" or box is None:
             continue
         wide = tuple(slice(max(s.start - 3, 0), s.stop + 3) for s in box)
-        around = binary_dilation(number[wide] == n, np.ones((3, 3), bool), iterations=2)
+        around = np.asarray(binary_dilation(number[wide] == n, np.ones((3, 3), bool), iterations=2), dtype=np.bool_)
         met = sorted({int(m) for m in np.unique(number[wide][around]) if 0 < m <= len(junctions)})
         length = max(s.stop - s.start for s in box) * size
         edges.append(LaneEdge(n, tuple(m - 1 for m in met), float(length)))

@@ -106,9 +106,7 @@ class Segment:
         return (self.feature_sum / max(float(np.linalg.norm(self.feature_sum)), 1e-12)).astype(np.float32)
 
 
-def segment_frame(
-    frame: FrameVoxels, names: Sequence[str] = (), config: SegmentConfig | None = None
-) -> list[Segment]:
+def segment_frame(frame: FrameVoxels, names: Sequence[str] = (), config: SegmentConfig | None = None) -> list[Segment]:
     """Return the segments of things in a frame; ground and sky are left out.
 
     `names` are the classes of `frame.labels`, or for a labelled model without occupancy classes its own labels. Largest
@@ -128,9 +126,7 @@ def segment_frame(
     groups.sort(key=lambda g: (-len(g), packed[g[0]]))
     crops = _crops(frame, [row[g][row[g] >= 0] for g in groups])
     size = max(len(names), 1)
-    segments = [
-        _segment(frame, packed[g], row[g], classes[g], crops[number], size) for number, g in enumerate(groups)
-    ]
+    segments = [_segment(frame, packed[g], row[g], classes[g], crops[number], size) for number, g in enumerate(groups)]
     return [s for s in segments if names or not _is_ground(s, frame, config)]
 
 
@@ -188,7 +184,7 @@ def _image_pairs(
     config: SegmentConfig,
     movable: np.ndarray,
 ) -> Int64[np.ndarray, "p 2"]:
-    """Return pairs of voxels of one class that are neighbours in an image with no depth edge between, but do not touch."""
+    """Return pairs of voxels of one class that are neighbours in an image without a depth edge between."""
     place = np.full(len(frame.seen) + 1, -1, dtype=np.int64)  # the last stands for pixels that see nothing
     place[row[row >= 0]] = np.flatnonzero(row >= 0)
     codes = []

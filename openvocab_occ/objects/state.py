@@ -64,8 +64,8 @@ class Motion:
     sightings: int
     """Frames it was seen in."""
     left: float = 1.0
-    """Share of the voxels of its first and latest sighting that other frames saw through: what moved left its place, and
-    its new place was empty before. 1 where nobody looked."""
+    """Share of the voxels of its first and latest sighting that other frames saw through: what moved left its place,
+    and its new place was empty before. 1 where nobody looked."""
 
 
 def shift(
@@ -119,9 +119,7 @@ def observe_motion(
     )
 
 
-def judge(
-    motion: Motion, *, movable: float, config: StateConfig | None = None
-) -> tuple[State, float, str]:
+def judge(motion: Motion, *, movable: float, config: StateConfig | None = None) -> tuple[State, float, str]:
     """Return the state, how sure it is (0 to 1, not a probability), and what speaks for it.
 
     `movable` is the share of the class evidence that speaks for a thing that can move: NaN where there is none.

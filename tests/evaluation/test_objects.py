@@ -30,7 +30,10 @@ def test_what_is_cut_in_two_is_a_duplicate_and_what_is_ignored_is_nothing():
     assert (nothing.ap50, nothing.recall50, nothing.odr) == (0.0, 0.0, 0.0)
 
 
-@given(st.lists(st.sets(st.integers(0, 30), min_size=1), max_size=5), st.lists(st.sets(st.integers(0, 30), min_size=1), max_size=5))
+@given(
+    st.lists(st.sets(st.integers(0, 30), min_size=1), max_size=5),
+    st.lists(st.sets(st.integers(0, 30), min_size=1), max_size=5),
+)
 def test_overlaps_are_those_of_sets(mine, yours):
     a, b = ([np.array(sorted(s), np.int64) for s in side] for side in (mine, yours))
     iou, share = overlaps(a, b)

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from openvocab_occ.errors import ConfigError
-from openvocab_occ.export.scene_graph import geojson, georeference, scene_graph, write_geojson, write_gltf, write_scene_graph
+from openvocab_occ.export.scene_graph import (
+    geojson,
+    georeference,
+    scene_graph,
+    write_geojson,
+    write_gltf,
+    write_scene_graph,
+)
 
 
 def test_the_graph_holds_every_node_and_is_plain_json(street, tmp_path):

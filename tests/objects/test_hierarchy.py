@@ -34,8 +34,8 @@ def crossing(arms, half=100, width=9):
     for x in range(-half, half):
         for y in range(-half, half):
             inside = abs(x) < width and abs(y) < width
-            way = (abs(x) < width and (y > 0 and "n" in arms or y < 0 and "s" in arms)) or (
-                abs(y) < width and (x > 0 and "e" in arms or x < 0 and "w" in arms)
+            way = (abs(x) < width and ((y > 0 and "n" in arms) or (y < 0 and "s" in arms))) or (
+                abs(y) < width and ((x > 0 and "e" in arms) or (x < 0 and "w" in arms))
             )
             if inside or way:
                 cells[x, y, 0] = ("driveable surface", "road")
@@ -55,10 +55,10 @@ def test_junctions_are_told_by_their_arms(arms, kind):
 
 
 def test_kinds_of_junctions():
-    assert junction_kind([0, np.pi / 2, np.pi]) == "T"
-    assert junction_kind([0, 2 * np.pi / 3, 4 * np.pi / 3]) == "Y"
-    assert junction_kind([0, 1, 2, 3]) == "cross"
-    assert junction_kind([0, 1, 2, 3, 4]) == "star"
+    assert junction_kind([0.0, np.pi / 2, np.pi]) == "T"
+    assert junction_kind([0.0, 2 * np.pi / 3, 4 * np.pi / 3]) == "Y"
+    assert junction_kind([0.0, 1.0, 2.0, 3.0]) == "cross"
+    assert junction_kind([0.0, 1.0, 2.0, 3.0, 4.0]) == "star"
 
 
 def test_a_crossing_has_four_stretches_of_road_that_meet_in_it():
@@ -75,7 +75,8 @@ def test_a_crossing_has_four_stretches_of_road_that_meet_in_it():
 def thing(id, label, center, size=(4.4, 2.0, 1.6), state="parked", yaw=0.0):
     return SceneObject(
         id=id, label=label, score=1.0, box=Box(np.array(center, float), np.array(size, float), yaw),
-        voxels=np.empty(0, np.int64), points=np.empty((0, 3), np.float32), embedding=vector(label), state=state, parent=0,
+        voxels=np.empty(0, np.int64), points=np.empty((0, 3), np.float32), embedding=vector(label), state=state,
+        parent=0,
     )  # fmt: skip
 
 
@@ -115,14 +116,14 @@ def test_parts_are_where_features_differ():
 
 def test_the_tree_goes_from_scene_to_parts_and_its_cuts_are_its_levels():
     voxels = truck_map()
-    cars = [thing(n + 20, "car", (6.0 * n, 4.0, 0.8)) for n in range(3)]
+    cars = [thing(n + 20, "car", (13.5 + 5.0 * n, 1.0, 0.8)) for n in range(3)]
     tree = build_tree([truck_of(voxels), *cars], voxels, names=NAMES, ego=[np.eye(4)])
     assert {node.level for node in tree.nodes} == set(LEVELS)
     assert tree[7].parent == tree[20].parent or tree[tree[20].parent].parent == tree[7].parent
     assert tree.region_of(7).label == "road segment"
     assert tree[tree[20].parent].label == "row of parked cars"
     assert [tree[id].level for id in tree[7].children] == ["part", "part"]
-    assert [depth for depth, _ in tree.walk()][0] == 0
+    assert next(depth for depth, _ in tree.walk()) == 0
     assert len(list(tree.walk())) == len(tree.nodes)
     cuts = dendrogram(tree)
     assert is_valid_linkage(cuts.linkage)

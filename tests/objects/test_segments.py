@@ -77,7 +77,11 @@ def test_a_car_behind_a_pole_is_one_thing():
     """The pole hides a slice of the car; the grid still knows the slice."""
     car = block("car", (0, 5, 0), (11, 5, 4))
     hidden = block("car", (5, 5, 0), (1, 5, 4))
-    front = [block("car", (0, 5, 0), (5, 5, 4)), block("car", (6, 5, 0), (5, 5, 4)), block("manmade", (5, 0, 0), (1, 1, 9))]
+    front = [
+        block("car", (0, 5, 0), (5, 5, 4)),
+        block("car", (6, 5, 0), (5, 5, 4)),
+        block("manmade", (5, 0, 0), (1, 1, 9)),
+    ]
     segments = segment_frame(frame_of(front, hidden=[hidden]), NAMES)
     assert kinds(segments) == [("car", 200), ("manmade", 9)]
     assert {len(s.body) for s in segments} == {len(car[0]), 9}

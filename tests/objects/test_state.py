@@ -12,9 +12,10 @@ metres = st.floats(-50, 50)
 @given(metres, metres, st.floats(0, 10), st.floats(0, 10))
 def test_a_rigid_shift_is_found_and_growing_is_none(low, way, length, more):
     a, b = np.array([low, 0.0]), np.array([low + length, 0.0])
-    np.testing.assert_allclose(shift(a, b, a + [way, 0], b + [way, 0]), [way, 0.0], atol=1e-9)
-    np.testing.assert_array_equal(shift(a, b, a - [more, 0], b + [more, 0]), [0, 0])
-    np.testing.assert_array_equal(shift(a, b, a, b + [more, 0]), [0, 0])
+    ahead, grown = np.array([way, 0.0]), np.array([more, 0.0])
+    np.testing.assert_allclose(shift(a, b, a + ahead, b + ahead), ahead, atol=1e-9)
+    np.testing.assert_array_equal(shift(a, b, a - grown, b + grown), [0, 0])
+    np.testing.assert_array_equal(shift(a, b, a, b + grown), [0, 0])
 
 
 def seen(path, length=4.4, times=None, **more):
