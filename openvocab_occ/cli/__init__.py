@@ -23,6 +23,7 @@ COMMANDS = {
     "export": Command("export:export", "render a semantic view of a map for a person or a model"),
     "eval keyframe": Command("evaluate:keyframe", "judge depth and answers by the LiDAR of a real keyframe"),
     "bench depth": Command("bench:depth", "time depth images beside other ways to them"),
+    "bench surface": Command("bench:surface", "judge voxel and smooth depth by three synthetic meshes"),
 }
 
 

@@ -59,3 +59,23 @@ def depth(
         f"`pixel` visibility {report.seconds_visible:.3f} s; half the voxel size in x and y takes "
         f"{report.half_voxel_ratio:.2f} times as long; peak memory {report.memory_over_output:.2f} times the output"
     )
+
+
+def surface(*, json: bool = False) -> None:
+    """Judge depth from voxels, and from the smooth surface of labels and of logits, by three synthetic meshes.
+
+    Args:
+        json: Print one JSON object.
+    """
+    from openvocab_occ.evaluation.mesh_scenes import surface_errors
+
+    errors = surface_errors()
+    if json:
+        print_json({"errors": [asdict(error) for error in errors]})
+        return
+    table = Table("mesh", "surface", "median", "90 % within", "bias", "seen by one only", box=None, pad_edge=False)
+    for e in errors:
+        table.add_row(
+            e.scene, e.surface, f"{e.median_m:.3f} m", f"{e.p90_m:.3f} m", f"{e.bias_m:+.3f} m", f"{e.misses:.1%}"
+        )
+    console().print(table)

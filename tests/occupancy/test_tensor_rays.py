@@ -56,7 +56,8 @@ def test_the_triton_kernel_agrees_with_the_walk_on_all_families():
     """By its interpreter, in a process of its own, because it has to be chosen before Triton is loaded."""
     run = subprocess.run(
         [sys.executable, str(HERE / "triton_families.py")],
-        env={**os.environ, "TRITON_INTERPRET": "1", "PYTHONPATH": str(PACKAGE)}, capture_output=True, text=True, timeout=240, check=False,
+        env={**os.environ, "TRITON_INTERPRET": "1", "PYTHONPATH": str(PACKAGE)},
+        capture_output=True, text=True, timeout=240, check=False,
     )  # fmt: skip
     assert run.returncode == 0, run.stderr[-2000:]
     found = json.loads(run.stdout)
