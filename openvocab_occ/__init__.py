@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from openvocab_occ.geometry.camera import Camera as Camera
     from openvocab_occ.geometry.grid import GridSpec as GridSpec
     from openvocab_occ.mapping.voxel_map import VoxelMap as VoxelMap
+    from openvocab_occ.networks.predictor import load_network as load_network
     from openvocab_occ.objects.scene_map import SceneMap as SceneMap
     from openvocab_occ.objects.tree import ObjectTree as ObjectTree
     from openvocab_occ.objects.tree import SceneObject as SceneObject
@@ -62,6 +63,7 @@ _HOME = {
     "export_views": "openvocab_occ.export.views",
     "find": "openvocab_occ.query.find",
     "load_encoder": "openvocab_occ.segmentation.onnx",
+    "load_network": "openvocab_occ.networks.predictor",
     "load_sequence": "openvocab_occ.datasets.registry",
     "render_depth": "openvocab_occ.depth.render",
     "view": "openvocab_occ.viewer.server",
