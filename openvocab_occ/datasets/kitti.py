@@ -1,7 +1,7 @@
 """KITTI odometry and SemanticKITTI: calibrated images, poses of camera 0, Velodyne sweeps, semantic voxels.
 
 The poses are of camera 0 in the frame of the first one (z forward). Here the ego lies on the road below camera 0, x
-forward and z up, and the world is the ego of the origin, so that grids around the ego hold the road as they do elsewhere.
+forward and z up, and the world is the ego of the origin: grids around the ego hold the road, as they do elsewhere.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,7 @@
 """`transforms.json` of nerfstudio and instant-ngp: one camera a frame, poses camera to world in OpenGL's axes.
 
-The world stays the file's (z up in nerfstudio; `up=` turns another). The ego is the camera, its axes turned to x forward,
-y left, z up of the camera. Principal points count from the corner of the image there, half a pixel less here.
+The world stays the file's (z up in nerfstudio; `up=` turns another). The ego is the camera, its axes turned to x
+forward, y left, z up of the camera. Principal points count from the corner of the image there, half a pixel less here.
 """
 
 import json

@@ -4,7 +4,7 @@ docs/recording.md tells the format; `write_recording` writes it.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -148,7 +148,7 @@ def _view(
         T_world_cam = T_world_ego @ _pose(entry, "T_ego_cam", what)
     camera = Camera(
         np.asarray(entry["K"], dtype=np.float64), image.shape[1], image.shape[0], T_world_cam,
-        tuple(entry.get("distortion", ())), entry.get("lens", "pinhole"),
+        tuple(float(k) for k in entry.get("distortion", ())), entry.get("lens", "pinhole"),
     )  # fmt: skip
     depth = None
     if entry.get("depth"):
@@ -179,15 +179,23 @@ def _occupancy(
         try:
             size = told["voxel_size"]
             spec = GridSpec(
-                tuple(told["origin"]), tuple(size) if isinstance(size, list) else size, tuple(told["shape"])
-            )
+                _three(told["origin"], float), _three(size, float) if isinstance(size, list) else float(size),
+                _three(told["shape"], int),
+            )  # fmt: skip
             grid = GridFormat(spec=spec, class_names=tuple(told["class_names"]), free_label=told.get("free_label"))
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, ValueError) as error:
+            if isinstance(error, DataError):
+                raise
             raise DataError(
                 f"grid of {where} is not told", expected="origin, voxel_size, shape, class_names", got=error
             ) from error
     T = _pose(entry, "T_world_grid", where) if "T_world_grid" in entry else T_world_ego
     return read_prediction(_inside(folder, entry["occupancy"]), grid, T, f"occupancy of {where}")
+
+
+def _three(values: Any, kind: Callable[[Any], Any]) -> tuple[Any, Any, Any]:
+    a, b, c = values
+    return kind(a), kind(b), kind(c)
 
 
 def _pose(entry: Mapping[str, Any], key: str, where: str) -> Float[np.ndarray, "4 4"]:

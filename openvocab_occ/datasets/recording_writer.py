@@ -112,7 +112,7 @@ def _write_grid(file: Path, grid: OccupancyGrid) -> None:
     if grid.known is not None:
         arrays["mask_lidar"] = grid.known.astype(np.uint8)
     with file.open("wb") as stream:
-        np.savez_compressed(stream, **arrays)
+        np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
 
 
 def _ready(file: Path) -> Path:

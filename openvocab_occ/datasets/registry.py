@@ -45,8 +45,8 @@ def load_sequence(
 
     Args:
         kind: One of
-            `nuscenes` (the official tables, Occ3D's `gts/` beside them), `nuscenes-infos` (mmdetection3d v1.1 info files),
-            `kitti` (odometry and SemanticKITTI), `rgbd` (7-Scenes, 3DMatch, TUM, ScanNet exports), `nerfstudio`
+            `nuscenes` (the official tables, Occ3D's `gts/` beside them), `nuscenes-infos` (mmdetection3d v1.1 info
+            files), `kitti` (odometry and SemanticKITTI), `rgbd` (7-Scenes, 3DMatch, TUM, ScanNet exports), `nerfstudio`
             (transforms.json), `colmap`, `rosbag` (ROS 1, ROS 2, MCAP), `recording` (our own folder, docs/recording.md),
             `city` (a made-up street; options `seed`, `frames`). The readers' own docs tell their options.
         root: File or folder of the drive.

@@ -35,7 +35,7 @@ class Trajectory:
 
         Args:
             time: Seconds.
-            tolerance: Before the first and after the last pose, and in a gap, the nearest one holds for so many seconds.
+            tolerance: Before the first and after the last pose, and in a gap, the nearest holds for so many seconds.
             max_gap: Nothing is interpolated between poses that lie further apart than this, seconds.
 
         Raises:

@@ -54,7 +54,8 @@ def read_surroundocc(path: PathLike, T_world_grid: ArrayLike | None = None) -> O
 def read_openoccupancy(path: PathLike, T_world_grid: ArrayLike | None = None) -> OccupancyGrid:
     """Read OpenOccupancy's `.npy` of rows z, y, x, [three speeds,] label, in the LiDAR's frame.
 
-    It is nuScenes-Occupancy v0.1. Voxels that are not listed are free; those labelled 0 are noise and unknown. The classes are Occ3D's.
+    It is nuScenes-Occupancy v0.1. Voxels that are not listed are free; those labelled 0 are noise and unknown. The
+    classes are Occ3D's.
     """
     rows = _rows(path, (4, 7))
     return _sparse(rows[:, 2::-1], rows[:, -1], OPENOCCUPANCY_SPEC, _IGNORED_OPENOCCUPANCY, T_world_grid, path)

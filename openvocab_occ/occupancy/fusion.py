@@ -1,8 +1,8 @@
 """Many sweeps and depth images in one grid: log-odds of being occupied, free space carved, unknown kept apart.
 
 Within one scan a voxel counts once, and a return beats whatever passes through the voxel (OctoMap, Hornung et al.
-2013), so that grazing rays do not eat the ground they end on. The walk is that of `grid_from_lidar`; the sums that follow it
-are a handful of numpy operations, which is why there is no kernel of their own.
+2013), so that grazing rays do not eat the ground they end on. The walk is that of `grid_from_lidar`; the sums that
+follow it are a handful of numpy operations, which is why there is no kernel of their own.
 """
 
 import math

@@ -150,7 +150,7 @@ def test_grids_of_the_keyframe(keyframe, labels):
     for name, array in flips(labels["lidar_ego"]).items():
         assert ("error", "grid axes") in look(array), name
     assert "'lidar'" in look(labels["lidar"])["error", "grid frame"]
-    assert "occupied" in look(np.where(labels["lidar_ego"] == OCC3D_FREE, 0, 17))["error", "grid"]
+    assert "occupied" in look(np.where(labels["lidar_ego"] == OCC3D_FREE, 0, 17).astype(np.uint8))["error", "grid"]
 
 
 @pytest.fixture

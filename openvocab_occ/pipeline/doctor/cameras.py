@@ -43,7 +43,8 @@ def _intrinsics(view: View) -> Finding | None:
     across, down = (cx + 0.5) / (w / 2), (cy + 0.5) / (h / 2)
     if w != h and abs(cx / h - 0.5) < 0.1 and abs(cy / w - 0.5) < 0.1 and max(w, h) > _SIZE_RATIO * min(w, h):
         return Finding(
-            "error", "intrinsics", f"{where}: K is of an image turned by 90 degrees", "its middle is that of height x width",
+            "error", "intrinsics", f"{where}: K is of an image turned by 90 degrees",
+            "its middle is that of height x width",
             "swap cx with cy and fx with fy, or turn the images",
         )  # fmt: skip
     scaled = across > 0 and down > 0 and max(across / down, down / across) < _SIZE_RATIO
@@ -66,7 +67,7 @@ def _intrinsics(view: View) -> Finding | None:
         )  # fmt: skip
     if not 1 / 1.3 < fx / fy < 1.3:
         return Finding(
-            "note", "intrinsics", f"{where}: pixels are not square, fx / fy = {fx / fy:.2f}", "true of squashed images only"
+            "note", "intrinsics", f"{where}: pixels are not square, fx / fy = {fx / fy:.2f}", "squashed images are so"
         )  # fmt: skip
     return None
 
@@ -158,8 +159,7 @@ def _check_free_cameras(sample: Sample) -> list[Finding]:
     if len(poses) < 2:
         return []
     up, up_inverted = _mean(-poses[:, :3, 1]), _mean(-invert(poses)[:, :3, 1])
-    forward = _mean(poses[:, :3, 2])
-    if np.linalg.norm(up) < 0.5 and np.linalg.norm(up_inverted) > 0.9 and np.linalg.norm(forward) < 0.9:
+    if np.linalg.norm(up) < 0.5 and np.linalg.norm(up_inverted) > 0.9:
         return [
             Finding(
                 "warning",

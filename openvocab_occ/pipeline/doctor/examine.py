@@ -23,6 +23,9 @@ from openvocab_occ.pipeline.doctor.lidar import check_lidar
 from openvocab_occ.pipeline.doctor.poses import check_depth, check_motion, check_sweeps
 from openvocab_occ.pipeline.doctor.sample import Sample, take_sample
 
+_CHECKS: Sequence[Callable[[Sample], list[Finding]]] = (
+    check_timestamps, check_intrinsics, check_rig, check_lidar, check_depth, check_sweeps, check_images, check_grids,
+)  # fmt: skip
 DEFAULT_FRAMES = 8
 """Frames that are read; four pairs of neighbours."""
 DENSE_DIM, LABEL_DIM = 768, 20
@@ -111,10 +114,9 @@ def examine(
     read = time.perf_counter() - started
     findings = check_files(sequence, sample)
     if sample.frames:
-        findings += [
-            *check_timestamps(sample), *check_intrinsics(sample), *check_rig(sample), *check_motion(sample, sequence.source),
-            *check_lidar(sample), *check_depth(sample), *check_sweeps(sample), *check_images(sample), *check_grids(sample),
-        ]  # fmt: skip
+        findings += check_motion(sample, sequence.source)
+        for check in _CHECKS:
+            findings += check(sample)
         findings += _geometry(sample)
     estimate = _estimate(sample, read)
     return Diagnosis(sequence.name, sequence.source, findings, estimate, sample)

@@ -30,7 +30,7 @@ class Finding:
 
 def worst(findings: Sequence[Finding]) -> Level:
     """Return the worst level of all, `ok` where there is nothing."""
-    return max((finding.level for finding in findings), key=LEVELS.index, default="ok")
+    return LEVELS[max((LEVELS.index(finding.level) for finding in findings), default=0)]
 
 
 def best_other(shares: Mapping[str, float], given: str, *, gain: float, least: float) -> str | None:

@@ -60,7 +60,8 @@ def _content(frame: Frame) -> Finding | None:
         most = int(values[counts.argmax()])
         return Finding(
             "error", "grid", f"{share:.0%} of what the grid of frame {frame.index} knows is occupied",
-            "streets and rooms are mostly air", f"the free label is {grid.free_label}; label {most} is the most frequent",
+            "streets and rooms are mostly air",
+            f"the free label is {grid.free_label}; label {most} is the most frequent",
         )  # fmt: skip
     return None
 
@@ -80,7 +81,7 @@ def turned(
     occupied: Bool[np.ndarray, "x y z"], axes: Sequence[int], flips: Sequence[bool]
 ) -> Bool[np.ndarray, "x y z"]:
     """Return the array with its axes permuted, then flipped."""
-    return np.flip(occupied.transpose(*axes), [i for i in range(3) if flips[i]])
+    return np.flip(occupied.transpose(*axes), tuple(i for i in range(3) if flips[i]))
 
 
 def _standing(frame: Frame) -> Float[np.ndarray, "n 3"]:
@@ -145,7 +146,7 @@ def _readings(frames: Sequence[Frame]) -> list[Finding]:
             Finding(
                 "ok",
                 "grid axes",
-                f"{given:.0%} of the measured points above the ground lie in occupied voxels, {best:.0%} at best otherwise",
+                f"{given:.0%} of the points above the ground lie in occupied voxels, {best:.0%} at best otherwise",
             )
         ]
     framed = other.startswith("in the frame")
@@ -158,7 +159,7 @@ def _readings(frames: Sequence[Frame]) -> list[Finding]:
             "error",
             "grid frame" if framed else "grid axes",
             f"grids look wrong: read {other} they fit",
-            f"{shares[other]:.0%} of the measured points above the ground lie in occupied voxels then, {given:.0%} as given",
+            f"{shares[other]:.0%} of the points above the ground lie in occupied voxels then, {given:.0%} as given",
             advice,
         )
     ]
@@ -238,7 +239,7 @@ def _path(frames: Sequence[Frame], sample: Sample) -> list[Finding]:
     places = np.array([
         a.T_world_ego[:3, 3] * (1 - w) + b.T_world_ego[:3, 3] * w
         for a, b in sample.pairs for w in np.linspace(0, 1, 5)
-    ]).reshape(-1, 3) + [0.0, 0.0, 1.2]  # fmt: skip
+    ]).reshape(-1, 3) + np.array([0.0, 0.0, 1.2])  # fmt: skip
     for frame in frames:
         grid = frame.occupancy
         assert grid is not None

@@ -177,8 +177,8 @@ def _moves(a: Frame, b: Frame) -> bool:
 
 
 def _sweep_share(a: Frame, b: Frame, reading: PoseReading) -> float:
-    """Return the share of standing returns near one of the other sweep; the ground slides on itself and tells nothing."""
-    from scipy.spatial import cKDTree
+    """Return the share of standing returns near one of the other sweep; the ground would slide on itself."""
+    from scipy.spatial import KDTree
 
     assert a.points is not None
     assert b.points is not None
@@ -191,7 +191,7 @@ def _sweep_share(a: Frame, b: Frame, reading: PoseReading) -> float:
     first, second = thinned(raised[0], 3000), raised[1]
     if len(first) < _MIN_POINTS or len(second) < _MIN_POINTS:
         return 0.0
-    return float((cKDTree(second).query(first, distance_upper_bound=_LIDAR_TOLERANCE)[0] < np.inf).mean())
+    return float((KDTree(second).query(first, distance_upper_bound=_LIDAR_TOLERANCE)[0] < np.inf).mean())
 
 
 def check_motion(sample: Sample, source: str) -> list[Finding]:

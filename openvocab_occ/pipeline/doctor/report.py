@@ -51,7 +51,8 @@ def page(diagnosis: "Diagnosis", pictures: list[str]) -> str:
     )
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>'
-        f"</head><body><h1>{title}</h1><p>{html.escape(summary(diagnosis))}</p><table>{rows}</table>{images}</body></html>\n"
+        f"</head><body><h1>{title}</h1><p>{html.escape(summary(diagnosis))}</p><table>{rows}</table>{images}"
+        "</body></html>\n"
     )
 
 
@@ -64,8 +65,9 @@ def summary(diagnosis: "Diagnosis") -> str:
     if cost is not None:
         said += (
             f" A map will have about {cost.voxels:,} voxels of {cost.voxel_size:g} m: {cost.megabytes_labels:,.1f} MB "
-            f"with labels, {cost.megabytes_dense:,.1f} MB with 768 features a voxel before they are compressed. Reading "
-            f"and ray casting take about {_duration(cost.read_seconds)} here; the 2D model runs {cost.images:,} times on top."
+            f"with labels, {cost.megabytes_dense:,.1f} MB with 768 features a voxel before they are compressed. "
+            f"Reading and ray casting take about {_duration(cost.read_seconds)} here; the 2D model runs "
+            f"{cost.images:,} times on top."
         )
     return said
 
