@@ -17,12 +17,14 @@ class Command(NamedTuple):
 
 COMMANDS = {
     "demo": Command("demo:demo", "build, ask, export and show the map of a synthetic street"),
+    "city": Command("city:city", "write a made-up town, driven many times, as a nuScenes tree"),
     "doctor": Command("doctor:doctor", "look at a drive before it is mapped, and say what is wrong"),
     "map": Command("map:build", "turn a drive and an ONNX model into a map"),
     "find": Command("find:find", "ask a map for things in words"),
     "view": Command("view:view", "show a map in the web browser"),
     "export": Command("export:export", "render a semantic view of a map for a person or a model"),
     "eval keyframe": Command("evaluate:keyframe", "judge depth and answers by the LiDAR of a real keyframe"),
+    "bench depth": Command("bench:depth", "time depth images beside other ways to them"),
 }
 
 
@@ -56,6 +58,11 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         code = tyro.cli(run, prog=f"openvocab-occ {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,))
     except OpenVocabOccError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except BrokenPipeError:  # the reader of a pipe had enough
+        sys.stdout = None
+    except OSError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:

@@ -34,7 +34,7 @@ def drive(frames, name="made up", source="test"):
 @pytest.fixture(scope="module")
 def street():
     """Two of the six cameras of four frames, which is enough to tell and quicker to look at."""
-    frames = load_sequence("city", seed=3, frames=4)
+    frames = load_sequence("street", seed=3, frames=4)
     return [replace(frame, views=frame.views[:2]) for frame in frames]
 
 
