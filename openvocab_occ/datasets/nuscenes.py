@@ -29,6 +29,7 @@ from openvocab_occ.occupancy.occ3d import read_occ3d
 
 LIDAR = "LIDAR_TOP"
 _SWEEP_COLUMNS = 5
+_MADE_UP = "v1.0-city"  # what `openvocab-occ city` writes
 
 
 @dataclass(frozen=True)
@@ -107,6 +108,7 @@ def load_nuscenes(
         range(len(keys)),
         lambda index: _frame(index, keys[index], cameras, has_lidar, labels_of(keys[index])),
         source="nuscenes",
+        synthetic=tables.name == _MADE_UP,
         files=files,
         info=_info(tables, scenes),
     )
