@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from openvocab_occ.datasets.frame import Frame
+from openvocab_occ.datasets.fused import MIN_LIDAR_RANGE
 from openvocab_occ.depth.render import render_depth
 from openvocab_occ.geometry import invert, transform
 from openvocab_occ.occupancy import OccupancyGrid
@@ -85,8 +86,11 @@ def turned(
 
 
 def _standing(frame: Frame) -> Float[np.ndarray, "n 3"]:
-    """Return the measured world points that do not lie on the ground."""
+    """Return the measured world points that lie neither on the ground nor on the own vehicle."""
     points = world_points(frame)
+    if frame.points is not None:
+        sensor = frame.poses.get("lidar", frame.T_world_ego)[:3, 3]
+        points = points[np.linalg.norm(points - sensor, axis=1) > MIN_LIDAR_RANGE]
     ground = None
     if frame.points is not None:
         ground = find_ground(frame.points.astype(np.float64))
