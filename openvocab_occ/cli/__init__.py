@@ -18,6 +18,7 @@ class Command(NamedTuple):
 COMMANDS = {
     "demo": Command("demo:demo", "build, ask, export and show the map of a synthetic street"),
     "city": Command("city:city", "write a made-up town, driven many times, as a nuScenes tree"),
+    "doctor": Command("doctor:doctor", "look at a drive before it is mapped, and say what is wrong"),
     "map": Command("map:build", "turn a drive and an ONNX model into a map"),
     "find": Command("find:find", "ask a map for things in words"),
     "view": Command("view:view", "show a map in the web browser"),
@@ -38,7 +39,7 @@ def _help() -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; return 0, or 2 for input that cannot be used."""
+    """Run one command; return what it returns (0 if nothing), or 2 for input that cannot be used."""
     words = sys.argv[1:] if arguments is None else arguments
     if not words or words[0] in ("-h", "--help"):
         print(_help())
@@ -56,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
     run = getattr(import_module(f"openvocab_occ.cli.{module}"), function)
     rest = words[name.count(" ") + 1 :]
     try:
-        tyro.cli(run, prog=f"openvocab-occ {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,))
+        code = tyro.cli(run, prog=f"openvocab-occ {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,))
     except OpenVocabOccError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -68,7 +69,7 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return 130
-    return 0
+    return code or 0
 
 
 def script() -> None:

@@ -122,7 +122,9 @@ class TestBadInput:
 
     def test_output_that_cannot_be_written_is_said_before_the_work(self, tmp_path, capsys):
         (tmp_path / "file").touch()
-        message = refused(capsys, "map", "street", "any", "--encoder", "no.onnx", "--out", tmp_path / "file" / "a.ovmap")
+        message = refused(
+            capsys, "map", "street", "any", "--encoder", "no.onnx", "--out", tmp_path / "file" / "a.ovmap"
+        )
         assert "cannot be written" in message
 
     @pytest.mark.data
