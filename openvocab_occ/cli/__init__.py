@@ -57,6 +57,11 @@ def main(arguments: list[str] | None = None) -> int:
     except OpenVocabOccError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:  # the reader of a pipe had enough
+        sys.stdout = None
+    except OSError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return 130

@@ -9,6 +9,8 @@ from rich.table import Table
 
 from openvocab_occ.cli.output import console, print_json, progress
 from openvocab_occ.cli.source import Source
+from openvocab_occ.io.files import output_folder
+from openvocab_occ.objects.ovmap import MANIFEST
 from openvocab_occ.objects.scene_map import SceneMap
 
 
@@ -37,6 +39,7 @@ def build(
     from openvocab_occ.segmentation.onnx import load_encoder
 
     started = time.perf_counter()
+    output_folder(out, marker=MANIFEST)
     model = load_encoder(encoder, card)
     with progress("mapping") as advance:
         scene = build_map(source.load(), model, voxel_size=voxel_size, max_depth=max_depth, progress=advance)

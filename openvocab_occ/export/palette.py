@@ -12,12 +12,13 @@ UNLABELLED = (150, 150, 150)
 """A voxel without a label; no label has this colour."""
 
 _NAMED = {
-    "road": (84, 88, 99), "driveable surface": (84, 88, 99), "curb": (196, 168, 120), "mark": (240, 240, 235),
+    "road": (84, 88, 99), "driveable surface": (84, 88, 99), "curb": (196, 168, 120), "mark": (225, 195, 70),
     "sidewalk": (190, 178, 166), "other flat": (146, 130, 138), "terrain": (150, 180, 100),
     "vegetation": (52, 128, 68), "tree": (52, 128, 68), "manmade": (178, 140, 112), "building": (178, 140, 112),
     "car": (45, 100, 205), "truck": (235, 125, 40), "bus": (245, 185, 35), "trailer": (180, 95, 30),
     "construction vehicle": (200, 150, 20), "motorcycle": (150, 60, 190), "bicycle": (205, 100, 215),
     "pedestrian": (222, 45, 85), "person": (222, 45, 85), "traffic cone": (255, 85, 0), "barrier": (120, 60, 60),
+    "background": (172, 180, 190),
     "others": (110, 120, 135), "pole": (200, 195, 70), "traffic sign": (250, 220, 60), "traffic light": (60, 190, 180),
 }  # fmt: skip
 _GOLDEN = 0.618033988749895  # steps of the golden section spread hues evenly, however many there are

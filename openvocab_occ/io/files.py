@@ -1,5 +1,6 @@
 """Files: friendly errors when missing, outputs that are whole or not there at all."""
 
+import difflib
 import hashlib
 import os
 import shutil
@@ -8,7 +9,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
-from openvocab_occ.errors import AlreadyExistsError, NotFoundError
+from openvocab_occ.errors import AlreadyExistsError, ConfigError, NotFoundError
 
 PathLike = str | os.PathLike[str]
 
@@ -21,11 +22,12 @@ def existing(path: PathLike, what: str) -> Path:
     parent = found.parent
     if not parent.is_dir():
         raise NotFoundError(f"{what} not found", expected=str(found), got=f"no folder {parent}", fix="check the path")
-    near = sorted(p.name for p in parent.iterdir())[:8]
+    names = sorted(p.name for p in parent.iterdir())
+    near = difflib.get_close_matches(found.name, names, n=3) or names[:3]
     raise NotFoundError(
         f"{what} not found",
         expected=str(found),
-        got=f"only {', '.join(near) or 'nothing'} in {parent}",
+        got=f"{len(names)} others there, such as {', '.join(near)}" if names else "an empty folder",
         fix="check the path",
     )
 
@@ -45,9 +47,8 @@ def fsync(path: Path) -> None:
         os.close(descriptor)
 
 
-@contextmanager
-def written_folder(path: PathLike, *, marker: str) -> Generator[Path, None, None]:
-    """Yield a temporary sibling of `path` to write into; on success it takes the place of `path`, else it is removed.
+def output_folder(path: PathLike, *, marker: str) -> Path:
+    """Return a path that `written_folder` may write, its parent made, or raise; worth asking before long work.
 
     An existing folder is replaced only if it holds a file called `marker`, so that no other folder is ever lost.
     """
@@ -58,7 +59,23 @@ def written_folder(path: PathLike, *, marker: str) -> Generator[Path, None, None
             expected=f"a folder with {marker}, or none",
             fix="choose another output path",
         )
-    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=target.parent).close()
+    except OSError as error:
+        raise ConfigError(
+            f"{target} cannot be written", got=error.strerror, fix="choose another output path"
+        ) from error
+    return target
+
+
+@contextmanager
+def written_folder(path: PathLike, *, marker: str) -> Generator[Path, None, None]:
+    """Yield a temporary sibling of `path` to write into; on success it takes the place of `path`, else it is removed.
+
+    What may be replaced is told by `output_folder`.
+    """
+    target = output_folder(path, marker=marker)
     scratch = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
     try:
         scratch.chmod(0o755)

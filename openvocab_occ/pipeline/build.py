@@ -10,7 +10,7 @@ from jaxtyping import Int32, UInt8
 
 from openvocab_occ._version import __version__
 from openvocab_occ.arrays import check_shape
-from openvocab_occ.datasets.frame import Frame, View
+from openvocab_occ.datasets.frame import Frame, FrameSequence, View
 from openvocab_occ.depth.render import render_depth
 from openvocab_occ.errors import ConfigError, DataError, ModelError
 from openvocab_occ.geometry import GridSpec, invert, pose, transform
@@ -30,7 +30,7 @@ MIN_LIDAR_RANGE = 2.2  # metres; nearer returns are of the car under the LiDAR (
 
 
 def build_map(
-    sequence: Sequence[Frame],
+    sequence: FrameSequence | Sequence[Frame],
     encoder: PixelEncoder,
     *,
     voxel_size: float | None = None,
@@ -44,9 +44,8 @@ def build_map(
     """
     if not len(sequence):
         raise DataError("sequence has no frames", expected="at least 1", got=0, fix="check the path and the slice")
-    if provenance is None:  # a plain list of frames will do, and has no name
-        made_up = bool(getattr(sequence, "synthetic", False))
-        provenance = Provenance(name=str(getattr(sequence, "name", "")), synthetic=made_up)
+    if provenance is None and isinstance(sequence, FrameSequence):
+        provenance = Provenance(source=sequence.source, name=sequence.name, synthetic=sequence.synthetic)
     builder = MapBuilder(encoder, voxel_size=voxel_size, max_depth=max_depth, provenance=provenance)
     for done, frame in enumerate(sequence, start=1):
         builder.integrate(frame)

@@ -30,8 +30,10 @@ from openvocab_occ.viewer.layers import (
 if TYPE_CHECKING:
     import viser
 
-LISTED = 10
-"""Hits in the list and with a caption in the scene."""
+CAPTIONED = 3
+"""Hits with label and score in the scene; those after them have their rank only, since captions overlap from afar."""
+LISTED = 8
+"""Hits in the list."""
 BOXED = 50
 """Hits with a box in the scene."""
 _KNOWN_SHOWN = 20
@@ -65,13 +67,13 @@ def answer_line(answer: Answer) -> str:
 
 def hit_table(scene: SceneMap, hits: list[Hit]) -> str:
     """Return the first hits as a table of markdown: rank, object, score, size, distance from the drive."""
-    rows = ["| | object | score | size, m | from ego |", "|-:|:-|-:|-:|-:|"]
+    rows = ["| | object | score | size, m | range |", "|-:|:-|-:|-:|-:|"]
     for rank, hit in enumerate(hits[:LISTED], start=1):
-        size = " × ".join(f"{edge:.1f}" for edge in hit.object.box.size)
+        size = "×".join(f"{edge:.1f}" for edge in hit.object.box.size)
         away = distance_to_path(scene, hit.object)
         rows.append(
-            f"| {rank} | {escape(hit.object.label)} #{escape(str(hit.object.id))} | {hit.score:.2f} | {size} |"
-            f" {'' if away is None else f'{away:.0f} m'} |"
+            f"| {rank} | {escape(hit.object.label)}&nbsp;#{hit.object.id} | {hit.score:.2f} | {size} |"
+            f" {'' if away is None else f'{away:.0f}&nbsp;m'} |"
         )
     rest = len(hits) - LISTED
     return "\n".join(rows) + (f"\n\nand {rest} more" if rest > 0 else "")
@@ -88,7 +90,7 @@ def provenance_line(scene: SceneMap) -> str:
     facts = [
         f"{len(scene.voxels):,} voxels of {scene.voxels.voxel_size:g} m",
         f"{len(scene.objects)} objects",
-        f"{len(scene.frames)} frames",
+        f"{len(scene.frames)} frame{'s' * (len(scene.frames) != 1)}",
         f"encoder {escape(scene.encoder.name)}",
     ]
     made = scene.provenance
@@ -193,7 +195,10 @@ class Panel:
             self._offer(hits)
             for node in self._drawn:
                 node.remove()
-            captions = [f"{rank} {hit.object.label} {hit.score:.2f}" for rank, hit in enumerate(hits[:LISTED], start=1)]
+            captions = [
+                f"{rank} {hit.object.label} {hit.score:.2f}" for rank, hit in enumerate(hits[:CAPTIONED], start=1)
+            ]
+            captions += [str(rank) for rank in range(CAPTIONED + 1, min(len(hits), LISTED) + 1)]
             margin = 0.75 * self.scene.voxels.voxel_size  # clear of the squares, which turn to the camera
             self._drawn = draw_hits(self.client.scene, [hit.object for hit in hits[:BOXED]], captions, margin)
             self._paint(self.mode.value)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import viser
 
 _FOV = 1.0  # radians, vertical
-_PANEL_WIDTH = 340
+_PANEL_WIDTH = 370
 
 
 class Viewer:

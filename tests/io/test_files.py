@@ -102,7 +102,7 @@ def test_existing_returns_the_path(tmp_path):
 def test_existing_names_what_lies_beside(tmp_path):
     (tmp_path / "lables.npz").touch()
     with pytest.raises(
-        NotFoundError, match=r"labels not found: expected .*labels\.npz, got only lables\.npz in .*; check"
+        NotFoundError, match=r"labels not found: expected .*labels\.npz, got 1 others there, such as lables\.npz; check"
     ):
         existing(tmp_path / "labels.npz", "labels")
     with pytest.raises(NotFoundError, match=r"labels not found: expected .*, got no folder .*nowhere"):

@@ -81,6 +81,7 @@ def test_a_typed_query_marks_the_right_objects(browser, viewer, street):
         page.get_by_text("not understood: parked").wait_for()
         for rank, id in enumerate(ids, start=1):
             cells = page.get_by_role("row", name=f"truck #{id}").get_by_role("cell").all_inner_texts()
+            cells = [cell.replace("\xa0", " ") for cell in cells]
             assert cells[:3] == [str(rank), f"truck #{id}", "0.89"]
         page.wait_for_function("() => window.__viserMutable.nodeRefFromName['/hits/edges'] != null")
         page.get_by_role("button", name="2", exact=True).click()

@@ -122,9 +122,9 @@ def test_the_list_ranks_and_measures(street):
         path = [frame.T_world_ego[:3, 3] for frame in street.frames]
         away = min(float(np.linalg.norm(point - hit.object.center)) for point in path)
         assert distance_to_path(street, hit.object) == pytest.approx(away)
-        assert f"car &#35;{hit.object.id}".replace("&#35;", "#") in row
-        assert f"| {away:.0f} m |" in row
-    assert "and 15 more" in hit_table(street, hits[:1] * 25)
+        assert f"car&nbsp;#{hit.object.id}" in row
+        assert f"| {away:.0f}&nbsp;m |" in row
+    assert "and 17 more" in hit_table(street, hits[:1] * 25)
 
 
 def test_synthetic_maps_say_so(street):
