@@ -54,7 +54,10 @@ def test_yaml_and_json_read_alike(tiny, tmp_path):
         ({"input__std": [1, 0, 1]}, "`input.std` above 0"),
         ({"input__mean": [float("nan"), 0, 0]}, "all of them finite"),
         ({"input__range": [1, 0]}, "low < high"),
-        ({"output__kind": "features"}, "features for contract dense|logits or probabilities or classes for contract logits"),
+        (
+            {"output__kind": "features"},
+            "logits or probabilities or classes for contract logits",
+        ),
         ({"output__layout": "NHW"}, "NHW is for kind `classes`"),
         ({"labels": ["a", "a"]}, "at least two, each once"),
         ({"contract": "dense", "output__kind": "features", "labels": None}, "contract dense needs `text`"),
