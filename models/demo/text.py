@@ -50,8 +50,8 @@ def words_of(folder: Path, lexicon: dict) -> tuple[list[str], np.ndarray]:
 
     lines = (folder / "vocab.txt").read_text(encoding="utf-8").splitlines()
     ranks = {word: rank for rank, word in enumerate(lines) if re.fullmatch(r"[a-z]+", word)}
-    phrases = [p for part in ("classes", "parts", "materials", "colors") for ps in lexicon[part].values() for p in ps]
-    phrases += [p for group in lexicon["groups"].values() for p in group["phrases"]] + lexicon["absent"]
+    entries = (entry for part in ("things", "parts", "materials") for entry in lexicon[part].values())
+    phrases = [word for entry in entries for word in entry["words"]] + lexicon["absent"] + lexicon["colors"]
     spoken = {word for phrase in phrases for word in re.findall(r"[a-z]+", phrase)}
     nouns = spoken | {word for word, rank in ranks.items() if 2000 <= rank < 12000 and len(word) > 3}
     plurals = {form for word in nouns for form in getInflection(word, tag="NNS") if re.fullmatch(r"[a-z]+", form)}

@@ -21,6 +21,11 @@ COMMANDS = {
     "find": Command("find:find", "ask a map for things in words"),
     "view": Command("view:view", "show a map in the web browser"),
     "export": Command("export:export", "render a semantic view of a map for a person or a model"),
+    "model probe": Command("model:probe", "look at an ONNX model without a card, and draft one"),
+    "model check": Command("model:check", "run the self-test of a model's card"),
+    "model bench": Command("model:bench", "time a model"),
+    "model show": Command("model:show", "print a model's card"),
+    "model calibrate": Command("model:calibrate", "fit probabilities from labelled voxels"),
     "eval keyframe": Command("evaluate:keyframe", "judge depth and answers by the LiDAR of a real keyframe"),
 }
 
