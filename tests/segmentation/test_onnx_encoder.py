@@ -14,7 +14,7 @@ from openvocab_occ.datasets.street import PALETTE
 from openvocab_occ.errors import CardError, ConfigError, ModelError, NotFoundError, UnsafeFileError
 from openvocab_occ.segmentation import FeatureMap, PixelEncoder
 from openvocab_occ.segmentation.card import InputCard
-from openvocab_occ.segmentation.demo_models import demo_model
+from openvocab_occ.segmentation.street_models import street_model
 from openvocab_occ.segmentation.onnx import load_encoder, prepare
 
 FLOAT = TensorProto.FLOAT
@@ -312,8 +312,8 @@ def test_unknown_provider(tiny, tmp_path):
         load_encoder(model, providers=("WarpExecutionProvider",))
 
 
-def test_demo_model_knows_the_street():
-    encoder = load_encoder(demo_model())
+def test_street_model_knows_the_street():
+    encoder = load_encoder(street_model())
     assert encoder.labels[-1] == "sky"
     assert len(encoder.labels) == len(PALETTE) == encoder.dim
     flat = [np.full((8, 8, 3), color, np.uint8) for color in PALETTE.values()]
@@ -355,5 +355,5 @@ def test_voc_model_sees_the_lorry(data):
 
 
 def test_sha256_of_the_demo_card_is_the_files():
-    digest = hashlib.sha256(demo_model().read_bytes()).hexdigest()
-    assert digest in demo_model().with_suffix(".card.yaml").read_text()
+    digest = hashlib.sha256(street_model().read_bytes()).hexdigest()
+    assert digest in street_model().with_suffix(".card.yaml").read_text()

@@ -3,7 +3,7 @@
 The mean colour x of each 4x4 block is scored for a class of colour c by -s |x - c|^2, less the term in |x|^2 that all
 classes share: s (2 c x - |c|^2), which is a 1x1 convolution. Colours come from the street's own palette.
 
-    python models/demo/make.py
+    python models/street/make.py
 """
 
 from pathlib import Path
@@ -57,10 +57,10 @@ def main(folder: Path = Path(__file__).parent) -> None:
         "output": {"name": "logits", "layout": "NCHW", "kind": "logits"},
         "labels": ["sky" if label == OCC3D_FREE else OCC3D_CLASSES[label] for label in PALETTE],
         "license": "Apache-2.0",
-        "source": "synthetic: made by models/demo/make.py from the palette of the street; knows no real image",
+        "source": "synthetic: made by models/street/make.py from the palette of the street; knows no real image",
         "sha256": sha256(path),
     }
-    text = "# Made by models/demo/make.py. Synthetic: it tells the flat colours of the made-up street apart.\n"
+    text = "# Made by models/street/make.py. Synthetic: it tells the flat colours of the made-up street apart.\n"
     (folder / "segmenter.card.yaml").write_text(text + yaml.safe_dump(card, sort_keys=False, default_flow_style=None))
 
 
