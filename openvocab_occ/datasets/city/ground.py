@@ -16,6 +16,7 @@ LAWN = 0.12
 _PAVED = 0.16  # of squares
 _PAINT = 0.006  # above the road
 _MARGIN = 80.0  # of lawn around the town
+_BELOW = -1.2  # of the country around; below any occupancy grid
 _COARSE, _MEDIUM, _FINE = 16.0, 2.0, 1.0  # edges of cells, metres
 BAY_LENGTH = 6.2
 """Of a parking bay, metres."""
@@ -142,13 +143,13 @@ def _country(plan: Plan) -> Mesh:
     round_ = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     hills = 16 + 9 * np.sin(3 * angle + 1) + 6 * np.sin(7 * angle) + 3 * np.sin(17 * angle)
     b = Builder()
-    near = np.hstack([middle + reach * round_, np.full((97, 1), -0.3)])
+    near = np.hstack([middle + reach * round_, np.full((97, 1), _BELOW)])
     far = np.hstack([middle + (reach + 160) * round_, hills[:, None]])
     i = np.arange(96)
     faces = np.concatenate([np.stack([i, i + 97, i + 98], axis=1), np.stack([i, i + 98, i + 1], axis=1)])
     b.add(np.concatenate([near, far]), faces, Surface(Material.LEAF, "#56713f"), Part.GROUND, solid=False)
     wide = reach + 5
-    meadow = [(middle[0] + sx * wide, middle[1] + sy * wide, -0.3) for sx, sy in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    meadow = [(middle[0] + sx * wide, middle[1] + sy * wide, _BELOW) for sx, sy in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     b.sheet(meadow, Surface(Material.GRASS, "#6b8048"), Part.GROUND)
     return b.mesh()
 

@@ -1,6 +1,7 @@
 """A camera's picture of the city, and the truth of every pixel."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32, UInt8
@@ -82,10 +83,18 @@ def render(
 
 def _camera_rays(camera: Camera) -> Float32[np.ndarray, "n 6"]:
     """Return origins and directions with z = 1 in the camera, so that the length along them is the z-depth."""
-    directions = camera.rays().reshape(-1, 3) @ camera.T_world_cam[:3, :3].T
+    directions = _pixel_directions(camera.K.tobytes(), camera.width, camera.height) @ camera.T_world_cam[
+        :3, :3
+    ].T.astype(np.float32)
     rays = np.empty((len(directions), 6), dtype=np.float32)
     rays[:, :3], rays[:, 3:] = camera.position, directions
     return rays
+
+
+@lru_cache(maxsize=16)
+def _pixel_directions(K: bytes, width: int, height: int) -> Float32[np.ndarray, "n 3"]:
+    camera = Camera(np.frombuffer(K).reshape(3, 3), width, height)
+    return camera.rays().reshape(-1, 3).astype(np.float32)
 
 
 def _edges(instance: np.ndarray, part: np.ndarray, material: np.ndarray, normal: np.ndarray) -> np.ndarray:

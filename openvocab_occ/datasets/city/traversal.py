@@ -85,6 +85,10 @@ class Traversal:
         """Which vehicle drove."""
         day = np.random.default_rng([town.seed, 51, number])
         self._azimuth, self._drift = float(day.uniform(-np.pi, np.pi)), float(day.uniform(0, 50))
+        self.num_frames = MAX_FRAMES
+        """Keyframes that count as the time of observation."""
+        self.moved_by: dict[int, float] = {}
+        """How far movers move while observed, as far as it was asked."""
         self._places: OrderedDict[tuple[int, int], Surroundings] = OrderedDict()
 
     @cached_property
@@ -163,6 +167,10 @@ class Traversal:
         table = gather([self.movers[i].thing for i in near], [poses[i] for i in near], around.origin, cull=False)
         moment = Moment(around.caster, Caster(table.vertices, table.faces), len(around.triangles))
         return Instant(joined(around.triangles, table), moment, around, tuple(self.movers[i] for i in near))
+
+    def forget(self) -> None:
+        """Drop what was gathered around places, to save memory."""
+        self._places.clear()
 
     def moved(self, instant: Instant, time: float) -> Moment:
         """Return how rays fall a little earlier or later; the table of triangles keeps its rows."""

@@ -21,7 +21,7 @@ def _shade(color: str, factor: float) -> str:
 
 
 def _leaves(b: Builder, center: np.ndarray, radii: np.ndarray, color: str, rng: np.random.Generator, *,
-            count: int = 150, size: float = 0.23) -> None:  # fmt: skip
+            count: int = 170, size: float = 0.23) -> None:  # fmt: skip
     """Scatter cards about an ellipsoid."""
     out = rng.normal(size=(count, 3))
     out /= np.linalg.norm(out, axis=1, keepdims=True)
@@ -39,7 +39,7 @@ def _leaves(b: Builder, center: np.ndarray, radii: np.ndarray, color: str, rng: 
 
 
 def _lump(b: Builder, center: np.ndarray, radii: np.ndarray, color: str, rng: np.random.Generator, *,
-          level: int = 2) -> None:  # fmt: skip
+          level: int = 1) -> None:  # fmt: skip
     bumps = 1 + 0.25 * (rng.random((len(icosphere(level)[0]), 1)) - 0.5)
     b.ball(center, radii * 0.94, Surface(Material.LEAF, _shade(color, 0.62)), Part.CROWN, level=level, bumps=bumps)
 
@@ -97,6 +97,6 @@ def bush(length: float, look: int) -> Mesh:
     for x in np.arange(-length / 2, length / 2 + 0.01, 0.55):
         center = np.array([x, rng.uniform(-0.1, 0.1), 0.42])
         radii: Float[np.ndarray, " 3"] = np.array([0.5, 0.46, 0.48]) * rng.uniform(0.9, 1.15)
-        _lump(b, center, radii, color, rng, level=1)
+        _lump(b, center, radii, color, rng)
         _leaves(b, center, radii, color, rng, count=60, size=0.13)
     return _mottled(b.mesh(), rng)
