@@ -13,7 +13,7 @@ from openvocab_occ._jit import num_threads
 from openvocab_occ.datasets.registry import load_sequence
 from openvocab_occ.depth.render import render_depth
 from openvocab_occ.pipeline.build import MapBuilder
-from openvocab_occ.segmentation.street_models import street_model
+from openvocab_occ.segmentation.demo_models import street_model
 from openvocab_occ.segmentation.onnx import load_encoder
 
 

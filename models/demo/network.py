@@ -3,6 +3,8 @@
 Plain convolutions train and run faster on processors than depthwise ones of fewer weights.
 """
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -38,9 +40,7 @@ class Segmenter(nn.Module):
         super().__init__()
         self.stem = _conv(3, 16, stride=2)
         stages = [nn.Sequential(_conv(16, _WIDTHS[0], stride=2))]
-        stages += [
-            nn.Sequential(_conv(a, b, stride=2), Residual(b)) for a, b in zip(_WIDTHS, _WIDTHS[1:], strict=False)
-        ]
+        stages += [nn.Sequential(_conv(a, b, stride=2), Residual(b)) for a, b in pairwise(_WIDTHS)]
         self.stages = nn.ModuleList(stages)
         self.laterals = nn.ModuleList(nn.Conv2d(width, _NECK, 1) for width in _WIDTHS)
         self.merges = nn.ModuleList(_conv(_NECK, _NECK) for _ in _WIDTHS[1:])

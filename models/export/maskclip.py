@@ -33,7 +33,7 @@ class DenseClip(nn.Module):
         """Return [n, channels, rows, columns]."""
         embeddings = self.vision.embeddings
         patches = embeddings.patch_embedding(pixel_values).flatten(2).transpose(1, 2)
-        token = embeddings.class_embedding.expand(len(patches), 1, -1)
+        token = embeddings.class_embedding.expand(patches.shape[0], 1, -1)
         x = self.vision.pre_layrnorm(torch.cat([token, patches], dim=1) + self.position)
         for layer in self.vision.encoder.layers[:-1]:
             found = layer(x, attention_mask=None)
@@ -41,7 +41,7 @@ class DenseClip(nn.Module):
         last = self.vision.encoder.layers[-1]
         values = last.self_attn.out_proj(last.self_attn.v_proj(last.layer_norm1(x)))[:, 1:]
         found = self.project(self.vision.post_layernorm(values))
-        return found.transpose(1, 2).reshape(len(found), -1, *self.grid)
+        return found.transpose(1, 2).unflatten(2, self.grid)
 
 
 def _resized(position: Tensor, grid: tuple[int, int]) -> Tensor:

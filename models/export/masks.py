@@ -1,9 +1,9 @@
 """Masks with one CLIP vector each, in SAN's way (arXiv 2302.12242), from a mask proposer and an image tower.
 
-Each mask gets a copy of CLIP's class token; in the last layers it attends to the patches with the mask's logits added to
-its attention, while patches go on as ever. Masks come from MaskFormer of `transformers`; the classes it was trained on
-are not used. SAN's own checkpoints need its own code: wrap them as a module that returns (masks, embeddings) and pass it
-to `openvocab_occ.segmentation.export.export_module`; the card is the same.
+Each mask gets a copy of CLIP's class token; in the last layers it attends to the patches with the mask's logits added
+to its attention, while patches go on as ever. Masks come from MaskFormer of `transformers`; the classes it was trained
+on are not used. SAN's own checkpoints need its own code: wrap them as a module that returns (masks, embeddings) and
+pass it to `openvocab_occ.segmentation.export.export_module`; the card is the same.
 
     python models/export/masks.py CLIP MASKFORMER OUT --size 448 448 --layers 3
 """
@@ -28,7 +28,12 @@ class MaskVectors(nn.Module):
 
     def __init__(self, clip: Any, proposer: Any, size: tuple[int, int], layers: int) -> None:
         super().__init__()
-        self.vision, self.project, self.proposer, self.last = clip.vision_model, clip.visual_projection, proposer, layers
+        self.vision, self.project, self.proposer, self.last = (
+            clip.vision_model,
+            clip.visual_projection,
+            proposer,
+            layers,
+        )
         patch = clip.config.patch_size
         self.grid = (size[0] // patch, size[1] // patch)
         self.position = nn.Parameter(_resized(self.vision.embeddings.position_embedding.weight, self.grid))
@@ -39,7 +44,7 @@ class MaskVectors(nn.Module):
         bias = functional.interpolate(masks, self.grid, mode="bilinear", align_corners=False).flatten(2)
         embeddings = self.vision.embeddings
         patches = embeddings.patch_embedding(pixel_values).flatten(2).transpose(1, 2)
-        token = embeddings.class_embedding.expand(len(patches), 1, -1)
+        token = embeddings.class_embedding.expand(patches.shape[0], 1, -1)
         x = self.vision.pre_layrnorm(torch.cat([token, patches], dim=1) + self.position)
         for layer in self.vision.encoder.layers[: -self.last]:
             x = _output(layer(x, attention_mask=None))
@@ -60,7 +65,7 @@ def _attend(layer: Any, asked: Tensor, patches: Tensor, bias: Tensor) -> Tensor:
     heads = attention.num_heads
 
     def split(x: Tensor) -> Tensor:
-        return x.reshape(len(x), x.shape[1], heads, -1).transpose(1, 2)
+        return x.unflatten(2, (heads, -1)).transpose(1, 2)
 
     normed, keys = layer.layer_norm1(asked), layer.layer_norm1(patches)
     q, k, v = split(attention.q_proj(normed)), split(attention.k_proj(keys)), split(attention.v_proj(keys))

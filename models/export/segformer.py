@@ -1,6 +1,6 @@
 """SegFormer: logits of its labels, a quarter of the image's size.
 
-    python models/export/segformer.py WEIGHTS OUT --size 512 1024
+python models/export/segformer.py WEIGHTS OUT --size 512 1024
 """
 
 from pathlib import Path

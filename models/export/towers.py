@@ -1,7 +1,7 @@
 """Text and image towers of CLIP and SigLIP 2: one vector a text, one vector an image.
 
-The image tower embeds whole images; the card feeds it with sliding windows (contract `crops`). For features of each patch
-see maskclip.py.
+The image tower embeds whole images; the card feeds it with sliding windows (contract `crops`). For features of each
+patch see maskclip.py.
 
     python models/export/towers.py WEIGHTS OUT          # OUT/text.onnx, OUT/image.onnx, cards, tokenizer.json
 """

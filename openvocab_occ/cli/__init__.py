@@ -27,6 +27,7 @@ COMMANDS = {
     "model bench": Command("model:bench", "time a model"),
     "model show": Command("model:show", "print a model's card"),
     "model calibrate": Command("model:calibrate", "fit probabilities from labelled voxels"),
+    "eval segmenter": Command("evaluate:segmenter", "judge a dense model by pixels and words on synthetic streets"),
     "eval keyframe": Command("evaluate:keyframe", "judge depth and answers by the LiDAR of a real keyframe"),
 }
 

@@ -35,14 +35,15 @@ NEVER_RENDERED: tuple[tuple[str, str], ...] = (("red", "truck"), ("green", "car"
 
 UNSEEN_SYNONYMS: dict[str, str] = {
     "lorries": "truck", "semi trailer truck": "truck", "pickup truck": "truck", "limousine": "car", "coupe": "car",
-    "convertible": "car", "motor car": "car", "minibus": "bus", "omnibus": "bus", "camper": "van", "scooter": "motorcycle",
-    "motorbikes": "motorcycle", "tricycle": "bicycle", "cycling": "bicycle", "child": "pedestrian", "walker": "pedestrian",
-    "boy": "pedestrian", "avenue": "road", "boulevard": "road", "lane": "road", "pavement": "sidewalk",
-    "pathway": "sidewalk", "villa": "building", "cottage": "building", "skyscraper": "building", "tower": "building",
-    "shrubbery": "bush", "maple": "tree", "conifer": "tree", "forest": "tree", "railing": "fence", "palisade": "fence",
-    "lantern": "street lamp", "streetlight": "street lamp", "signpost": "traffic sign", "billboard": "traffic sign",
-    "barricade": "barrier", "pasture": "grass", "field": "grass", "heaven": "sky", "caravan": "trailer",
-    "crane": "construction vehicle", "stone wall": "wall", "pylon": "traffic cone",
+    "convertible": "car", "motor car": "car", "minibus": "bus", "omnibus": "bus", "camper": "van",
+    "scooter": "motorcycle", "motorbikes": "motorcycle", "tricycle": "bicycle", "cycling": "bicycle",
+    "child": "pedestrian", "walker": "pedestrian", "boy": "pedestrian", "avenue": "road", "boulevard": "road",
+    "lane": "road", "pavement": "sidewalk", "pathway": "sidewalk", "villa": "building", "cottage": "building",
+    "skyscraper": "building", "tower": "building", "shrubbery": "bush", "maple": "tree", "conifer": "tree",
+    "forest": "tree", "railing": "fence", "palisade": "fence", "lantern": "street lamp", "streetlight": "street lamp",
+    "signpost": "traffic sign", "billboard": "traffic sign", "barricade": "barrier", "pasture": "grass",
+    "field": "grass", "heaven": "sky", "caravan": "trailer", "crane": "construction vehicle", "stone wall": "wall",
+    "pylon": "traffic cone",
 }  # fmt: skip
 """Words, none of them in a training list, and the class each should be nearest to."""
 

@@ -59,5 +59,7 @@ def _check_output(card: Card, port: Port, reader: Reader) -> None:
         raise reader.misfit(
             f"{reader.dim} channels in layout {layout}, {reader.channel_source()}",
             f"{channels} in {port}",
-            "check output.layout and labels" if reader.card.kind != "features" else "check output.layout and text",
+            "check output.layout and labels"
+            if not reader.from_text
+            else "check output.layout: such features are not aligned",
         )

@@ -78,7 +78,7 @@ def export_module(
 def compare(
     path: Path, inputs: Mapping[str, "torch.Tensor"], wanted: Sequence["torch.Tensor"], outputs: Sequence[str]
 ) -> float:
-    """Return the largest relative difference between what ONNX Runtime gives and what was wanted; raise above TOLERANCE."""
+    """Return the largest relative difference of what ONNX Runtime gives to what was wanted; raise above TOLERANCE."""
     found = Session(path).run_many(list(outputs), {name: value.numpy() for name, value in inputs.items()})
     worst = 0.0
     for name, ours, theirs in zip(outputs, found, wanted, strict=True):

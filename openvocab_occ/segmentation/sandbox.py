@@ -89,7 +89,7 @@ class SandboxedEncoder:
         try:
             write_frame(stdin, request)
             answer = _read_frame(stdout, seconds)
-        except (EOFError, OSError, TimeoutError, msgspec.DecodeError) as error:
+        except (EOFError, OSError, TimeoutError, ValueError) as error:  # ValueError: closed, or no msgpack
             late = isinstance(error, TimeoutError)
             self.close()
             raise ModelError(

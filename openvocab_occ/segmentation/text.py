@@ -143,7 +143,8 @@ class OnnxTextEncoder:
         if card.pooling == "none":
             return raw
         if card.pooling == "mean":
-            return (raw * mask[:, :, None]).sum(axis=1) / np.maximum(mask.sum(axis=1), 1)[:, None]
+            kept = mask.astype(np.float32)
+            return (raw * kept[:, :, None]).sum(axis=1) / np.maximum(kept.sum(axis=1), 1)[:, None]
         at = {
             "cls": np.zeros(count, dtype=np.intp),
             "last": np.maximum(mask.sum(axis=1) - 1, 0),

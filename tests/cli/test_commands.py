@@ -9,7 +9,7 @@ import pytest
 
 from openvocab_occ.cli import COMMANDS, main
 from openvocab_occ.segmentation.card import SHIPPED
-from openvocab_occ.segmentation.street_models import street_model
+from openvocab_occ.segmentation.demo_models import street_model
 
 
 @pytest.fixture(scope="module")

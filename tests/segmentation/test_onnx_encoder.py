@@ -14,7 +14,7 @@ from openvocab_occ.datasets.street import PALETTE
 from openvocab_occ.errors import CardError, ConfigError, ModelError, NotFoundError, UnsafeFileError
 from openvocab_occ.segmentation import FeatureMap, PixelEncoder
 from openvocab_occ.segmentation.card import InputCard
-from openvocab_occ.segmentation.street_models import street_model
+from openvocab_occ.segmentation.demo_models import street_model
 from openvocab_occ.segmentation.onnx import load_encoder, prepare
 
 FLOAT = TensorProto.FLOAT
