@@ -13,7 +13,6 @@ from openvocab_occ.io.files import PathLike, existing, sha256
 from openvocab_occ.segmentation.card_files import CONFIRM, find_card
 from openvocab_occ.segmentation.session import Limits, Port, Session
 
-_SIDE = 256  # pixels tried where height and width are free
 _MULTIPLES = (1, 2, 4, 8, 14, 16, 28, 32, 64)
 _FEW = 3  # colours
 _LABELS_AT_MOST = 400  # more channels than this are features
@@ -44,7 +43,7 @@ def probe(model: PathLike) -> Finding:
     Raises ModelError or UnsafeFileError like `load_encoder`; a model that merely fails to run is a note.
     """
     path = existing(model, "ONNX model")
-    session = Session(path, limits=Limits(seconds=60))
+    session = Session(path, limits=Limits(seconds=60.0))
     try:
         card = find_card(path, session.embedded_card)[0].name
     except CardError as error:
@@ -81,18 +80,18 @@ def _try(
         shapes = _run(session, port, rows, columns)
         note = f"a run at {columns} x {rows} " + ("worked" if isinstance(shapes, dict) else f"failed: {shapes}")
         return [note], shapes if isinstance(shapes, dict) else {}, (rows, columns), None
-    shapes = _run(session, port, _SIDE, _SIDE * 2)
-    if not isinstance(shapes, dict):
-        tried = _run(session, port, 224, 224)
-        note = f"height and width are free, but a run at {_SIDE * 2} x {_SIDE} failed: {shapes}"
-        more = "; one at 224 x 224 worked" if isinstance(tried, dict) else ""
-        return [note + more], tried if isinstance(tried, dict) else {}, (224, 224) if more else None, None
+    refused = ""
     for multiple in _MULTIPLES:
         odd = -(-100 // multiple) | 1  # an odd number of multiples, so that twice the multiple would not pass
-        if isinstance(_run(session, port, odd * multiple, (odd + 2) * multiple), dict):
-            note = f"height and width are free; the least multiple that ran is {multiple}"
-            return [note], shapes, None, multiple
-    return ["height and width are free, within limits that were not found"], shapes, (_SIDE, _SIDE * 2), None
+        shapes = _run(session, port, odd * multiple, (odd + 2) * multiple)
+        if isinstance(shapes, dict):
+            return [f"height and width are free; the least multiple that ran is {multiple}"], shapes, None, multiple
+        refused = refused or shapes
+    note = f"height and width are free, but a run at 103 x 101 failed: {refused}"
+    shapes = _run(session, port, 224, 224)
+    if isinstance(shapes, dict):
+        return [f"{note}; one at 224 x 224 worked"], shapes, (224, 224), None
+    return [note], {}, None, None
 
 
 def _run(session: Session, port: Port, height: int, width: int) -> dict[str, tuple[int, ...]] | str:
@@ -105,19 +104,19 @@ def _run(session: Session, port: Port, height: int, width: int) -> dict[str, tup
         return str(error.got or error)[:160]
     named = dict(zip((out.name for out in session.outputs), found, strict=True))
     sums = {name for name, array in named.items() if array.ndim == 4 and _sums_to_one(array)}
-    return _Shapes({name: array.shape for name, array in named.items()}, sums)
+    return _Shapes({name: array.shape for name, array in named.items()}, sums, (height, width))
 
 
 class _Shapes(dict[str, tuple[int, ...]]):
-    """Shapes of outputs, and which of them hold probabilities."""
+    """Shapes of outputs, which of them hold probabilities, and the height and width that was fed."""
 
-    def __init__(self, shapes: dict[str, tuple[int, ...]], probabilities: set[str]) -> None:
+    def __init__(self, shapes: dict[str, tuple[int, ...]], probabilities: set[str], fed: tuple[int, int]) -> None:
         super().__init__(shapes)
-        self.probabilities = probabilities
+        self.probabilities, self.fed = probabilities, fed
 
 
 def _sums_to_one(array: np.ndarray) -> bool:
-    return array.min() >= 0 and any(np.abs(array.sum(axis=axis) - 1).max() < 0.02 for axis in (1, 3))
+    return bool(array.min() >= 0 and any(np.abs(array.sum(axis=axis) - 1).max() < 0.02 for axis in (1, 3)))
 
 
 def _draft(
@@ -169,12 +168,10 @@ def _propose(
         lines = ["layout: NCHW", "kind: masks", f"embeddings: {vectors[0].name}",
                  f'mask_activation: "{CONFIRM}: sigmoid, softmax or none"']  # fmt: skip
         return masks[0].name, "masks", lines, text
-    best = ranked[0]
+    best, fed = ranked[0], getattr(shapes, "fed", size or (224, 224))
     shape = shapes.get(best.name, tuple(n or 0 for n in best.shape))
     if len(shape) == 4:
-        layout = (
-            "NCHW" if shape[1] not in (0, *shape[2:3]) and shape[1] != shape[-1] and _channels_first(shape) else "NHWC"
-        )
+        layout = "NCHW" if _channels_first(shape, fed) else "NHWC"
         channels = shape[1] if layout == "NCHW" else shape[3]
         if channels in _FEATURES or channels > _LABELS_AT_MOST:
             return best.name, "dense", [f"layout: {layout}", f"kind: features    # {channels} channels"], text
@@ -186,21 +183,22 @@ def _propose(
     if len(shape) == 3:
         if best.numpy in (np.int64, np.int32, np.uint8):
             return best.name, "logits", ["layout: NHW", "kind: classes"], [f'labels: ["{CONFIRM}"]']
-        prefix, patch = _patches(shape[1], size)
+        prefix, patch = _patches(shape[1], fed)
         lines = ["layout: NTC", "kind: features", f"prefix_tokens: {prefix}", f"patch: {patch}"]
         return best.name, "tokens", lines, text
     return best.name, "crops", ["layout: NC", "kind: embedding"], text
 
 
-def _channels_first(shape: tuple[int, ...]) -> bool:
-    """Height and width are more alike to each other than to the channels."""
-    return abs(shape[2] - shape[3]) <= abs(shape[1] - shape[2])
+def _channels_first(shape: tuple[int, ...], fed: tuple[int, int]) -> bool:
+    """Tell which axes are shaped as the image was; where both are, the fewer numbers are the channels."""
+    first = abs(shape[2] * fed[1] - shape[3] * fed[0]) / max(1, shape[3] * fed[0])
+    last = abs(shape[1] * fed[1] - shape[2] * fed[0]) / max(1, shape[2] * fed[0])
+    return shape[1] <= shape[3] if abs(first - last) < 0.05 else first < last
 
 
-def _patches(tokens: int, size: tuple[int, int] | None) -> tuple[int | str, int | str]:
-    height, width = size or (_SIDE, _SIDE * 2)
+def _patches(tokens: int, fed: tuple[int, int]) -> tuple[int | str, int | str]:
     for patch in (14, 16, 8, 32):
-        spare = tokens - (height // patch) * (width // patch)
+        spare = tokens - (fed[0] // patch) * (fed[1] // patch)
         if 0 <= spare <= 9:
             return spare, patch
     return f'"{CONFIRM}"', f'"{CONFIRM}"'

@@ -16,6 +16,7 @@ from openvocab_occ.segmentation import FeatureMap, PixelEncoder
 from openvocab_occ.segmentation.card import InputCard
 from openvocab_occ.segmentation.demo_models import street_model
 from openvocab_occ.segmentation.onnx import load_encoder, prepare
+from openvocab_occ.segmentation.session import PROVIDERS
 
 FLOAT = TensorProto.FLOAT
 
@@ -304,6 +305,22 @@ def test_foreign_operators_are_refused(tiny, tmp_path, domain, kind):
     tiny.write_card(model)
     with pytest.raises(UnsafeFileError, match=rf"needs the operator {domain}\.{kind}"):
         load_encoder(model)
+
+
+def test_providers_that_are_not_there_fall_back_with_a_warning(tiny, tmp_path, image):
+    import onnxruntime
+
+    missing = [short for short, name in PROVIDERS.items() if name not in onnxruntime.get_available_providers()]
+    if not missing:
+        pytest.skip("this onnxruntime has every provider")
+    model = tiny.identity(tmp_path / "m.onnx")
+    tiny.write_card(model)
+    with pytest.warns(RuntimeWarning, match="falling back to CPUExecutionProvider"):
+        encoder = load_encoder(model, providers=(*missing, "cpu"))
+    assert encoder.session.providers == ("CPUExecutionProvider",)
+    np.testing.assert_array_equal(encoder.encode([image])[0].cells, load_encoder(model).encode([image])[0].cells)
+    with pytest.raises(ConfigError, match="threads is not usable: expected at least 1, got 0"):
+        load_encoder(model, threads=0)
 
 
 def test_unknown_provider(tiny, tmp_path):
