@@ -64,8 +64,8 @@ def test_map_find_export_print_json(street, tmp_path, capsys):
     report = printed(capsys)
     assert "view.json" in report["files"]
     assert report["answer"]["hits"] == answer["hits"]
-    assert main(["map", "street", "any", "--encoder", str(street_model()), "--out", str(tmp_path / "a.ovmap"), "--frames",
-                 "1", "--json"]) == 0  # fmt: skip
+    out = ["--out", str(tmp_path / "a.ovmap"), "--frames", "1", "--json"]
+    assert main(["map", "street", "any", "--encoder", str(street_model()), *out]) == 0
     report = printed(capsys)
     assert report["frames"] == 1
     assert report["synthetic"] is True
@@ -122,7 +122,9 @@ class TestBadInput:
 
     def test_output_that_cannot_be_written_is_said_before_the_work(self, tmp_path, capsys):
         (tmp_path / "file").touch()
-        message = refused(capsys, "map", "street", "any", "--encoder", "no.onnx", "--out", tmp_path / "file" / "a.ovmap")
+        message = refused(
+            capsys, "map", "street", "any", "--encoder", "no.onnx", "--out", tmp_path / "file" / "a.ovmap"
+        )
         assert "cannot be written" in message
 
     @pytest.mark.data
