@@ -31,6 +31,9 @@ COMMANDS = {
     "file convert": Command("file:convert", "write a map or points in another format"),
     "eval keyframe": Command("evaluate:keyframe", "judge depth and answers by the LiDAR of a real keyframe"),
     "bench depth": Command("bench:depth", "time depth images beside other ways to them"),
+    "bench lift": Command("bench:lift", "time the lift beside dense ways"),
+    "bench fuse": Command("bench:fuse", "time fusing a long loop"),
+    "bench map": Command("bench:map", "time keyframes, RGB-D frames beside object clouds, and size files"),
 }
 
 
