@@ -32,6 +32,16 @@ COMMANDS = {
     "eval keyframe": Command("evaluate:keyframe", "judge depth and answers by the LiDAR of a real keyframe"),
     "bench depth": Command("bench:depth", "time depth images beside other ways to them"),
     "bench surface": Command("bench:surface", "judge voxel and smooth depth by three synthetic meshes"),
+    "file info": Command("file:info", "say what a map holds"),
+    "file verify": Command("file:verify", "check every byte of a map"),
+    "file merge": Command("file:merge", "merge two drives of one place"),
+    "file diff": Command("file:diff", "say what appeared, vanished or changed between two maps"),
+    "file crop": Command("file:crop", "cut a box out of a map"),
+    "file concat": Command("file:concat", "put maps that share no voxel together"),
+    "file convert": Command("file:convert", "write a map or points in another format"),
+    "bench lift": Command("bench:lift", "time the lift beside dense ways"),
+    "bench fuse": Command("bench:fuse", "time fusing a long loop"),
+    "bench map": Command("bench:map", "time keyframes, RGB-D frames beside object clouds, and size files"),
 }
 
 
