@@ -22,11 +22,13 @@ def greatest(records: list[tuple[int, int, bytes]]) -> tuple[int, int, bytes]:
 
 
 def window(
-    voxels: dict[tuple[int, int, int], np.ndarray], T_world_ego: np.ndarray, spec: GridSpec, cell: float, z0: float
-) -> dict[tuple[int, int, int], np.ndarray]:
-    """Return the logits of the map voxel nearest to each grid voxel's centre, where there is one."""
-    index = np.stack(np.meshgrid(*(np.arange(n) for n in spec.shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    logits: np.ndarray, known: np.ndarray, low: np.ndarray, T_world_ego: np.ndarray, spec: GridSpec, z0: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what a dense map in memory, of cells of 0.4 m with voxel `low` first, knows of a grid."""
+    index = np.stack(np.meshgrid(*(np.arange(n) for n in spec.shape), indexing="ij"), axis=-1)
     world = transform(T_world_ego, np.asarray(spec.centers(index)))
-    keys = np.floor((world - [0, 0, z0]) / cell + FACE).astype(int)
-    pairs = zip(map(tuple, index.tolist()), map(tuple, keys.tolist()), strict=True)
-    return {where: voxels[key] for where, key in pairs if key in voxels}  # pyright: ignore
+    where = np.floor((world - [0, 0, z0]) / 0.4 + FACE).astype(int) - low
+    inside = ((where >= 0) & (where < known.shape)).all(axis=-1)
+    x, y, z = np.moveaxis(np.where(inside[..., None], where, 0), -1, 0)
+    seen = inside & known[x, y, z]
+    return np.where(seen[..., None], logits[x, y, z], 0), seen

@@ -122,8 +122,8 @@ class MapSchema:
                 fix="update openvocab_occ",
             )  # fmt: skip
         try:
-            names = ("class_names", "heights", "cell", "z0", "dtype", "journal")
-            return MapSchema(**{name: data[name] for name in names})
+            rest = {name: data[name] for name in ("heights", "cell", "z0", "dtype", "journal")}
+            return MapSchema(tuple(data["class_names"]), **rest)
         except (KeyError, TypeError, ConfigError) as error:
             raise MapError(f"{where} has damaged attributes", got=error) from error
 

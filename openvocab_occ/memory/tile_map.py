@@ -213,9 +213,9 @@ class TileMap:
         window = Window(T_world_ego, spec, self.schema)
         ticks = ticks_of(stamp)
         safe_name(log, "log")
-        self.admit(agent)
         flat = np.flatnonzero(mask)
         codes = self.schema.encode(logits.reshape(-1, logits.shape[-1])[flat])
+        self.admit(agent)
         entry = journal.Entry(window.T_world_ego, spec, flat, codes, ticks, agent, log, policy)
         if self.schema.journal and len(flat):
             journal.append(self.store, entry)

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -15,6 +16,12 @@ SPEC = GridSpec((-4.0, -4.8, -1.0), 0.4, (20, 24, 8))
 @pytest.fixture
 def city(tmp_path: Path) -> TileMap:
     return TileMap.create(tmp_path / "city.tiles", NAMES, heights=8)
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    """Shape checks off: bad input meets our own errors, as in a user's hands."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 def random_pose(rng: np.random.Generator, *, tilt: float = 0.05, reach: float = 60.0) -> np.ndarray:
