@@ -21,6 +21,16 @@ COMMANDS = {
     "find": Command("find:find", "ask a map for things in words"),
     "view": Command("view:view", "show a map in the web browser"),
     "export": Command("export:export", "render a semantic view of a map for a person or a model"),
+    "memory build": Command("memory:build", "write the occupancy of a drive into the global map"),
+    "memory read": Command("memory:read", "read the prior around a place"),
+    "memory write": Command("memory:write", "write one window of logits"),
+    "memory merge": Command("memory:merge", "put maps into one"),
+    "memory diff": Command("memory:diff", "tell what appeared, vanished and changed"),
+    "memory info": Command("memory:info", "describe a global map"),
+    "memory verify": Command("memory:verify", "find damaged tiles, and mend them from the journal"),
+    "memory rebuild": Command("memory:rebuild", "make a map anew, without an agent or by another policy"),
+    "memory export": Command("memory:export", "draw a map, or write its voxels to a file"),
+    "crowdsource": Command("crowdsource:crowdsource", "let agents drive concurrently into one map"),
     "eval keyframe": Command("evaluate:keyframe", "judge depth and answers by the LiDAR of a real keyframe"),
 }
 

@@ -28,7 +28,7 @@ def window(
     index = np.stack(np.meshgrid(*(np.arange(n) for n in spec.shape), indexing="ij"), axis=-1)
     world = transform(T_world_ego, np.asarray(spec.centers(index)))
     where = np.floor((world - [0, 0, z0]) / 0.4 + FACE).astype(int) - low
-    inside = ((where >= 0) & (where < known.shape)).all(axis=-1)
+    inside = np.asarray(((where >= 0) & (where < known.shape)).all(axis=-1))
     x, y, z = np.moveaxis(np.where(inside[..., None], where, 0), -1, 0)
     seen = inside & known[x, y, z]
     return np.where(seen[..., None], logits[x, y, z], 0), seen

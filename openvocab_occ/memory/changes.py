@@ -67,8 +67,10 @@ def diff(before: TileMap, after: TileMap) -> Changes:
         x, y = a.decode(old.payload[cell, height]).argmax(axis=-1), b.decode(new.payload[cell, height]).argmax(axis=-1)
         rows = x != y
         parts.append((centers(a, key, cell[rows], height[rows]), x[rows], y[rows]))
-    points, x, y = (np.concatenate(p) for p in zip(*parts, strict=True)) if parts else (np.empty((0, 3)), *[np.empty(0, np.int64)] * 2)  # fmt: skip
-    return Changes(a.class_names, points, x.astype(np.int64), y.astype(np.int64), *map(int, tallies), a.free)
+    parts.append((np.empty((0, 3)), *[np.empty(0, dtype=np.int64)] * 2))
+    points, x, y = (np.concatenate(part) for part in zip(*parts, strict=True))
+    compared, learnt, forgotten = map(int, tallies)
+    return Changes(a.class_names, points, x.astype(np.int64), y.astype(np.int64), compared, learnt, forgotten, a.free)
 
 
 def diff_times(city: TileMap, before: float, after: float) -> Changes:

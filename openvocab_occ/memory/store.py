@@ -19,7 +19,16 @@ Location = PathLike | Mapping[str, Any]
 
 _FULL = ("os_error_code='27'", "os_error_code='28'", "os_error_code='122'", "No space left", "RESOURCE_EXHAUSTED")
 _READ_ONLY = ("os_error_code='13'", "os_error_code='30'", "os_error_code='1'", "PERMISSION_DENIED", "AccessDenied")
-_DAMAGED = ("DATA_LOSS", "Truncated", "Error decoding", "CRC", "checksum", "corrupt", "INVALID_ARGUMENT", "FAILED_PRECONDITION")
+_DAMAGED = (
+    "DATA_LOSS",
+    "Truncated",
+    "Error decoding",
+    "CRC",
+    "checksum",
+    "corrupt",
+    "INVALID_ARGUMENT",
+    "FAILED_PRECONDITION",
+)
 
 
 class Conflict(Exception):

@@ -306,9 +306,13 @@ class TileMap:
                 return merge_tiles(new.stamps, new.writers, new.payload, tile.stamps, tile.writers, tile.payload)
 
             self._layer(_BASE).update(tiles, change)
-        self.store.write_json(_REGISTRY + safe_name(log, "log"), {"log": log, "consolidated": True})
+        self.mark_consolidated(log)
         self.store.delete(f"{_overlay(log)}c.")
         return len(keys)
+
+    def mark_consolidated(self, log: str) -> None:
+        """Say that what was written of a log is in the base."""
+        self.store.write_json(_REGISTRY + safe_name(log, "log"), {"log": log, "consolidated": True})
 
     def tiles(
         self, *, exclude_logs: Collection[str] = (), keys: Iterable[TileKey] | None = None
