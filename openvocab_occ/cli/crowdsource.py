@@ -98,7 +98,7 @@ def drive(source: Source, path: str, number: int, frames: list[int]) -> int:
 
     city, sequence = TileMap.open(path), source.load()
     agent, first = f"agent-{number + 1}", sequence[frames[0]].timestamp
-    for n, index in enumerate(frames):
+    for index in frames:
         seen = observe(sequence[index])
         stamp = seen.time - first + _APART * number  # all start together
         city.write(seen.logits, seen.mask, seen.T_world_grid, seen.spec, stamp=stamp, agent=agent, log=agent)

@@ -74,7 +74,7 @@ def draw_stages(
     aspect = span[1] / span[0]
     front = max(3 * span[2] / span[0], 0.12)  # heights three times as large: streets are flat
     width = 12.0 / len(stages) if len(stages) > 1 else 9.0
-    figure = Figure(figsize=(width * len(stages), width * (aspect + front) * 0.95 + 1.0), dpi=150, layout="constrained")
+    figure = Figure(figsize=(width * len(stages), width * (aspect + front) * 0.95 + 1.4), dpi=150, layout="constrained")
     grid = figure.subplots(2, len(stages), squeeze=False, height_ratios=[aspect, front])
     shown: set[int] = set()
     for column, (title, stage) in enumerate(stages):
@@ -88,7 +88,7 @@ def draw_stages(
             extent = (*bounds[:, right].tolist(), *bounds[:, up].tolist())
             axis = grid[row, column]
             axis.imshow(image, extent=extent, interpolation="nearest", aspect=3 if row else 1)
-            axis.set_title(" · ".join(filter(None, (title, name))), fontsize=9)
+            axis.set_title(" · ".join(filter(None, (title, name))), fontsize=9, pad=4)
             axis.set_xlabel("x, m", fontsize=8)
             axis.set_ylabel("yz"[row] + ", m", fontsize=8)
             axis.tick_params(labelsize=7)

@@ -46,7 +46,10 @@ def observe(frame: Frame) -> Observation:
 
 
 def seen_by(camera: Camera, grid: OccupancyGrid) -> Bool[np.ndarray, "x y z"]:
-    """Tell which voxels a camera sees: no other occupied voxel is hit on the way to their centres (LMPOcc III-D)."""
+    """Tell which voxels a camera sees (LMPOcc III-D).
+
+    Of the ray to each voxel's centre the first occupied voxel is seen, and the centre's own where nothing is before it.
+    """
     index = np.stack(np.meshgrid(*(np.arange(n) for n in grid.spec.shape), indexing="ij"), axis=-1).reshape(-1, 3)
     points = grid.spec.centers(index) @ grid.T_world_grid[:3, :3].T + grid.T_world_grid[:3, 3]
     pixels, depth = camera.project(points)
@@ -55,5 +58,6 @@ def seen_by(camera: Camera, grid: OccupancyGrid) -> Bool[np.ndarray, "x y z"]:
     way = points[inside] - camera.position
     hits = cast_rays(grid, camera.position, way)
     seen = np.zeros(len(points), dtype=np.bool_)
-    seen[inside] = (hits.voxel == inside) | (hits.voxel < 0) | (hits.distance > np.linalg.norm(way, axis=1))
+    seen[hits.voxel[hits.voxel >= 0]] = True
+    seen[inside] |= (hits.voxel == inside) | (hits.voxel < 0) | (hits.distance > np.linalg.norm(way, axis=1))
     return seen.reshape(grid.spec.shape)

@@ -332,6 +332,11 @@ class TileMap:
 
         return rebuild(self, without=(without,) if isinstance(without, str) else without, **options)
 
+    def forget(self) -> None:
+        """Drop the tiles kept in memory."""
+        with self._lock:
+            self._cache.clear()
+
     def _layer(self, prefix: str) -> Layer:
         with self._lock:
             if prefix not in self._layers:

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
-from tests.memory.conftest import NAMES, SPEC, centred, random_logits, random_pose
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -20,6 +19,7 @@ from openvocab_occ.memory._tiles_reference import greatest, rows_of_voxels, wind
 from openvocab_occ.memory.layer import TileKey
 from openvocab_occ.memory.schema import CELLS, LEVELS, TILE, MapSchema, Tile
 from openvocab_occ.memory.window import Window
+from tests.memory.conftest import NAMES, SPEC, centred, random_logits, random_pose
 
 
 def write(city, logits, mask, T, *, spec=SPEC, stamp=100.0, agent="a", log="one", **more):
@@ -371,7 +371,7 @@ def test_refused(tmp_path, city, rng, unchecked):
         write(city, logits, mask[1:], T)
     broken = logits.copy()
     broken[3, 3, 3, 1] = np.nan
-    with pytest.raises(DataError, match="logits under the mask are not finite: .*1 of 3840 voxels"):
+    with pytest.raises(DataError, match=r"logits under the mask are not finite: .*1 of 3840 voxels"):
         write(city, broken, mask, T)
     with pytest.raises(ConfigError, match="stamp is not a time"):
         write(city, logits, mask, T, stamp=1e12)

@@ -1,18 +1,15 @@
 """Many writers, kills, full disks, damaged chunks: nothing that was acknowledged is lost."""
 
 import os
-import random
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from openvocab_occ.errors import MapError, StorageError
-from openvocab_occ.geometry import GridSpec
+from openvocab_occ.evaluation.memory_stress import CLASSES, Stress, fight, kill
 from openvocab_occ.memory import TileMap
 from openvocab_occ.memory.fold import repair
 from openvocab_occ.memory.health import verify
@@ -20,84 +17,21 @@ from tests.memory.conftest import NAMES, SPEC, random_logits
 from tests.memory.test_tile_map import contents, write
 
 ROOT = Path(__file__).resolve().parents[2]
-LINE = GridSpec((0.0, 0.0, -1.0), 0.4, (256, 4, 8))  # over four tiles in a row
-WRITER = """
-import os, sys
-os.environ["NUMBA_NUM_THREADS"] = "1"
-import numpy as np
-from openvocab_occ.geometry import GridSpec
-from openvocab_occ.memory import TileMap
-path, me, count, journal = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), sys.argv[4:]
-city, spec = TileMap.open(path), GridSpec((0.0, 0.0, -1.0), 0.4, (256, 4, 8))
-print("ready", flush=True)
-sys.stdin.readline()
-for n in range(count):
-    # an update owns one voxel in each of the four tiles; all writers share the chunks
-    mask = np.zeros(spec.shape, bool)
-    at = me * 100 + n % 100
-    mask[np.arange(4) * 64 + at % 64, at // 64 % 4, at // 256] = True
-    logits = np.full((*spec.shape, 4), 0.0, np.float32)
-    logits[..., n % 4] = 4
-    city.write(logits, mask, np.eye(4), spec, stamp=1000.0 + n, agent=f"agent-{me}", log="shared")
-    print(n, flush=True)
-"""
-
-
-def start(city: TileMap, me: int, count: int) -> subprocess.Popen[str]:
-    arguments = [sys.executable, "-c", WRITER, city.store.name, str(me), str(count)]
-    child = subprocess.Popen(
-        arguments, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    assert child.stdout is not None
-    assert child.stdout.readline() == "ready\n"
-    return child
-
-
-def go(*children: subprocess.Popen[str]) -> None:
-    for child in children:
-        assert child.stdin is not None
-        child.stdin.write("\n")
-        child.stdin.flush()
-
-
-def missing(city: TileMap, me: int, updates: list[int]) -> int:
-    """How many of the voxels of these updates do not hold them, or something later of the same writer."""
-    prior, lost = city.read(np.eye(4), LINE), 0
-    for n in updates:
-        at = me * 100 + n % 100
-        where = (np.arange(4) * 64 + at % 64, at // 64 % 4, at // 256)
-        lost += 4 - int((prior.known[where] & (prior.logits[where].argmax(-1) == n % 4)).sum())
-    return lost
 
 
 def test_three_writers_on_shared_chunks_lose_nothing(tmp_path):
-    city = TileMap.create(tmp_path / "m", NAMES, heights=8, journal=False)
-    children = [start(city, me, 25) for me in range(3)]
-    go(*children)
-    for child in children:
-        out, err = child.communicate(timeout=100)
-        assert child.returncode == 0, err
-        assert out.split()[-1] == "24"
-    assert sum(missing(city, me, [*range(25)]) for me in range(3)) == 0
+    city = TileMap.create(tmp_path / "m", CLASSES, heights=8, journal=False)
+    assert fight(city, updates=25) == Stress(updates=75, lost=0, unreadable=0)
     assert sum(int((tile.stamps > 0).sum()) for _, tile in city.tiles()) == 3 * 25 * 4
 
 
 def test_kills_at_random_points_leave_every_chunk_whole(tmp_path):
-    city = TileMap.create(tmp_path / "m", NAMES, heights=8)
-    dice = random.Random(3)
-    for me in range(3):
-        child = start(city, me, 90)
-        go(child)
-        time.sleep(dice.uniform(0.1, 0.6))
-        os.kill(child.pid, signal.SIGKILL)
-        out, _ = child.communicate()
-        acknowledged = [int(word) for word in out.split()]
-        assert verify(city).sound
-        assert missing(city, me, acknowledged) == 0
+    city = TileMap.create(tmp_path / "m", CLASSES, heights=8)
+    found = kill(city, kills=3)
+    assert (found.kills, found.lost, found.unreadable) == (3, 0, 0)
     before = contents(city)
     city.rebuild()  # an update cut off after its journal entry is completed
-    after = contents(city)
-    assert before.keys() <= after.keys()
+    assert before.keys() <= contents(city).keys()
     assert verify(city).sound
 
 
@@ -128,7 +62,6 @@ import resource, sys
 import numpy as np
 from openvocab_occ.errors import StorageError
 from openvocab_occ.memory import TileMap
-from openvocab_occ.geometry import GridSpec
 city, spec = TileMap.open(sys.argv[1]), GridSpec((-4.0, -4.8, -1.0), 0.4, (20, 24, 8))
 logits = np.random.default_rng(1).normal(0, 2, (20, 24, 8, 4)).astype(np.float32)
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
@@ -164,7 +97,7 @@ def test_a_read_only_map_can_be_read_and_says_so(tmp_path, rng):
         for p in parents[:-1]:
             p.chmod(0o755)
         os.seteuid(65534)
-        with pytest.raises(StorageError, match="cannot be written: it is read-only.*check its permissions"):
+        with pytest.raises(StorageError, match=r"cannot be written: it is read-only.*check its permissions"):
             write(TileMap.open(city.store.name), random_logits(rng), np.ones(SPEC.shape, bool), np.eye(4), stamp=2.0)
         assert TileMap.open(city.store.name).read(np.eye(4), SPEC).known.all()
     finally:
