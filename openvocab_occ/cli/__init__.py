@@ -17,6 +17,7 @@ class Command(NamedTuple):
 
 COMMANDS = {
     "demo": Command("demo:demo", "build, ask, export and show the map of a synthetic street"),
+    "city": Command("city:city", "write a made-up town, driven many times, as a nuScenes tree"),
     "map": Command("map:build", "turn a drive and an ONNX model into a map"),
     "find": Command("find:find", "ask a map for things in words"),
     "view": Command("view:view", "show a map in the web browser"),
@@ -33,6 +34,7 @@ COMMANDS = {
     "crowdsource": Command("crowdsource:crowdsource", "let agents drive concurrently into one map"),
     "bench memory": Command("bench_memory:memory", "measure the global map"),
     "eval keyframe": Command("evaluate:keyframe", "judge depth and answers by the LiDAR of a real keyframe"),
+    "bench depth": Command("bench:depth", "time depth images beside other ways to them"),
 }
 
 

@@ -70,10 +70,12 @@ def kill(city: TileMap, *, kills: int = 3, seed: int = 0) -> Stress:
     for _ in range(kills):
         process = _start(city, 0, first, 10**6)
         _go(process)
-        time.sleep(dice.uniform(0.05, 0.5))
+        assert process.stdout is not None
+        acknowledged = process.stdout.readline()  # it has warmed up
+        time.sleep(dice.uniform(0.0, 0.3))
         os.kill(process.pid, signal.SIGKILL)
         out, _ = process.communicate()
-        numbers = [int(line) for line in out.split("\n")[:-1]]  # the last may be cut off
+        numbers = [int(line) for line in (acknowledged + out).split("\n")[:-1]]  # the last may be cut off
         health = verify(city)
         unreadable += sum(map(len, health.damaged.values())) + len(health.damaged_entries)
         lost += _lost(city, 0, numbers[-_SLOTS + 1 :])

@@ -9,10 +9,10 @@ from openvocab_occ._jit import kernel
 
 @kernel
 @no_type_check
-def quantise(logits, reach, start, stop, out):
-    """Write 255 for the first largest logit of a row, and for one d below it 255 (1 - sqrt(d / reach)), down to 0.
+def quantise(logits, top, start, stop, out):
+    """Write `top` for the first largest logit of a row, and top exp(-d / 2) for one that is d below it.
 
-    No other logit gets 255, so that the largest stays the largest.
+    No other logit gets `top`, so that the largest stays the largest.
     """
     for n in range(start, stop):
         best = 0
@@ -20,9 +20,9 @@ def quantise(logits, reach, start, stop, out):
             if logits[n, c] > logits[n, best]:
                 best = c
         for c in range(logits.shape[1]):
-            below = (np.float64(logits[n, best]) - logits[n, c]) / reach
-            out[n, c] = np.uint8(min(254.0, np.rint(255.0 * (1.0 - np.sqrt(min(below, 1.0))))))
-        out[n, best] = 255
+            below = np.float64(logits[n, best]) - logits[n, c]
+            out[n, c] = np.uint8(min(top - 1.0, np.rint(top * np.exp(-0.5 * below))))
+        out[n, best] = top
 
 
 @kernel

@@ -27,10 +27,15 @@ FORMAT = 1
 FREE = "free"
 
 DType = Literal["uint8", "float16", "float32"]
-REACH = 16.0
-"""How far below the largest of their voxel the uint8 quantiser keeps log-probabilities: to a ten-millionth."""
-LEVELS = (-REACH * ((255 - np.arange(256)) / 255) ** 2).astype(np.float32)
-"""What each code stands for: fine steps among likely classes, up to 0.125 among those that are out of question."""
+TOP = 127
+"""The uint8 code of the largest class of a voxel; another of its classes has TOP sqrt(p / p_max), rounded, and less.
+
+Equal steps of sqrt(p) spend the bits where probabilities are large; none is off by more than about 0.005.
+"""
+REACH = 12.0
+"""What code 0 stands for: a log-probability this far below the largest."""
+LEVELS = np.maximum(2 * np.log(np.arange(256).clip(1e-9, TOP) / TOP), -REACH).astype(np.float32)
+"""What each code stands for, relative to the largest class."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +100,7 @@ class MapSchema:
             "writer": f"the next {4 * heights}: uint32 of each height, the agent's name stands in agents/ in hex",
             "logits": f"the next {size}: [height, class] {self.dtype}",
         }
-        value = "-reach * ((255 - code) / 255) ** 2, less its mean over the classes"
+        value = "max(2 ln(code / top), -reach), less its mean over the classes"
         return {
             "openvocab_occ": {
                 "kind": "tile map",
@@ -106,7 +111,7 @@ class MapSchema:
                 "origin_chunk": dict(zip(("floor", "x", "y"), ORIGIN, strict=True)),
                 "byte_order": "little",
                 "planes": planes,
-                "quantiser": {"reach": REACH, "value": value} if self.dtype == "uint8" else None,
+                "quantiser": {"top": TOP, "reach": REACH, "value": value} if self.dtype == "uint8" else None,
             }
         }
 
@@ -142,7 +147,7 @@ class MapSchema:
             )  # fmt: skip
         if self.dtype == "uint8":
             codes = np.empty(rows.shape, dtype=np.uint8)
-            in_slices(lambda a, b: quantise(rows, REACH, a, b, codes), len(rows), grain=8192)
+            in_slices(lambda a, b: quantise(rows, TOP, a, b, codes), len(rows), grain=8192)
             return codes
         with np.errstate(over="ignore"):
             centred = (rows - rows.mean(axis=1, keepdims=True)).astype(self.dtype)

@@ -10,9 +10,11 @@ from openvocab_occ._jit import in_slices
 from openvocab_occ.arrays import as_floats, check_shape
 from openvocab_occ.errors import ConfigError, DataError
 from openvocab_occ.geometry import invert, transform
-from openvocab_occ.occupancy._rays_kernels import first_hits
+from openvocab_occ.occupancy._rays_kernels import first_hits, first_hits_over_blocks
 from openvocab_occ.occupancy.grid import OccupancyGrid
 
+LARGE = 1 << 22
+"""Voxels from which on rays leap over empty blocks: two to three times as fast in 1024 x 1024 x 64, not in Occ3D's."""
 _GRAIN = 2048  # rays worth a thread: about half a millisecond
 
 
@@ -89,9 +91,17 @@ def trace_lattice(
     t = np.empty(len(steps), dtype=np.float32)
     voxel = np.empty(len(steps), dtype=np.int32)
     occupied = grid.occupied
-    in_slices(
-        lambda start, stop: first_hits(starts, steps, occupied, t_max, start, stop, t, voxel), len(steps), grain=_GRAIN
-    )
+    if grid.spec.num_voxels >= LARGE:
+        blocks = grid.blocks
+
+        def work(start: int, stop: int) -> None:
+            first_hits_over_blocks(starts, steps, blocks, occupied, t_max, start, stop, t, voxel)
+    else:
+
+        def work(start: int, stop: int) -> None:
+            first_hits(starts, steps, occupied, t_max, start, stop, t, voxel)
+
+    in_slices(work, len(steps), grain=_GRAIN)
     return t, voxel
 
 

@@ -38,5 +38,10 @@ def random_logits(rng: np.random.Generator, spec: GridSpec = SPEC, classes: int 
     return rng.normal(0, 2, (*spec.shape, classes)).astype(np.float32)
 
 
+def probabilities(logits: np.ndarray) -> np.ndarray:
+    e = np.exp(logits.astype(np.float64) - logits.max(axis=-1, keepdims=True))
+    return e / e.sum(axis=-1, keepdims=True)
+
+
 def centred(logits: np.ndarray) -> np.ndarray:
     return logits - logits.mean(axis=-1, keepdims=True)

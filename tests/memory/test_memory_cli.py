@@ -16,7 +16,9 @@ from openvocab_occ.occupancy import OCC3D_CLASSES
 @pytest.fixture(scope="module")
 def driven(tmp_path_factory):
     path = tmp_path_factory.mktemp("maps") / "street.tiles"
-    assert main(["memory", "build", "city", "any", "--out", str(path), "--frames", "2", "--agent", "car-1", "--json"]) == 0  # fmt: skip
+    assert (
+        main(["memory", "build", "city", "any", "--out", str(path), "--frames", "2", "--agent", "car-1", "--json"]) == 0
+    )
     return path
 
 
@@ -51,13 +53,18 @@ def test_read_write_diff(driven, tmp_path, capsys):
     window = {"logits": logits, "mask": known, "T_world_ego": np.eye(4), "origin": (-40, -40, -1.0), "voxel_size": 0.4}
     np.savez(tmp_path / "w.npz", **window)
     copy = TileMap.create(tmp_path / "copy.tiles", OCC3D_CLASSES)
-    written = run(capsys, "memory", "write", copy.store.name, tmp_path / "w.npz", "--stamp", 9, "--agent", "b", "--log", "l")  # fmt: skip
+    written = run(
+        capsys, "memory", "write", copy.store.name, tmp_path / "w.npz", "--stamp", 9, "--agent", "b", "--log", "l"
+    )
     assert written["voxels"] == written["changed"] == known.sum()
     changes = run(capsys, "memory", "diff", driven, copy.store.name)
     assert changes["compared"] > 1000
     assert main(["memory", "diff", str(driven)]) == 2
     assert "nothing to compare with" in capsys.readouterr().err
-    assert main(["memory", "write", str(driven), str(driven / "zarr.json"), "--stamp", "1", "--agent", "b", "--log", "l"]) == 2  # fmt: skip
+    assert (
+        main(["memory", "write", str(driven), str(driven / "zarr.json"), "--stamp", "1", "--agent", "b", "--log", "l"])
+        == 2
+    )
     assert "is no window" in capsys.readouterr().err
 
 
