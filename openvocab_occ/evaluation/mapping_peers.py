@@ -104,14 +104,14 @@ class ObjectClouds:
         return points[label == np.bincount(label[label >= 0]).argmax()]
 
     def _place(self, points: Float[np.ndarray, "n 3"], feature: Float32[np.ndarray, " c"]) -> None:
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
         low, high = points.min(axis=0), points.max(axis=0)
         best, at = self.threshold, -1
         for number, (cloud, known, _) in enumerate(self.objects):
             if (cloud.min(axis=0) > high).any() or (cloud.max(axis=0) < low).any():
                 continue
-            near, _ = cKDTree(cloud).query(points, distance_upper_bound=self.voxel_size)
+            near, _ = KDTree(cloud).query(points, distance_upper_bound=self.voxel_size)
             score = float(np.isfinite(near).mean() + feature @ known)
             if score > best:
                 best, at = score, number

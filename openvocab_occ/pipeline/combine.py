@@ -141,7 +141,7 @@ def aligned(a: SceneMap, b: SceneMap) -> Alignment:
     size = a.voxels.voxel_size
     clouds = []
     for scene in (b, a):
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(scene.voxels.centers))
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(scene.voxels.centers.copy()))
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=4 * size, max_nn=30))
         clouds.append(cloud)
     T = np.eye(4)

@@ -6,7 +6,7 @@ import pytest
 
 from openvocab_occ.cli import main
 from openvocab_occ.errors import ConfigError, DataError, MissingExtraError
-from openvocab_occ.export.formats import Cloud, convert, read_bt, read_cloud
+from openvocab_occ.export.formats import convert, read_bt, read_cloud
 from openvocab_occ.export.formats.octomap import write_bt
 from openvocab_occ.export.formats.openlex3d import read_openlex3d
 from openvocab_occ.mapping import FreeSpace, VoxelMap
@@ -131,8 +131,3 @@ def test_the_file_commands(saved, tmp_path, capsys):
     assert run("convert", saved, tmp_path / "street.ply")["bytes"] > 0
     assert main(["file", "info", str(tmp_path / "none.ovmap")]) == 2
     assert "map not found" in capsys.readouterr().err
-
-
-def test_columns_of_a_cloud_must_fit():
-    with pytest.raises(DataError, match="column weight of a cloud has the wrong shape"):
-        Cloud(np.zeros((3, 3)), None, {"weight": np.zeros(2)})
