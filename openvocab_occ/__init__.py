@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from openvocab_occ.geometry.camera import Camera as Camera
     from openvocab_occ.geometry.grid import GridSpec as GridSpec
     from openvocab_occ.mapping.voxel_map import VoxelMap as VoxelMap
+    from openvocab_occ.memory.tile_map import TileMap as TileMap
+    from openvocab_occ.memory.window import Prior as Prior
     from openvocab_occ.networks.predictor import load_network as load_network
     from openvocab_occ.objects.scene_map import SceneMap as SceneMap
     from openvocab_occ.objects.tree import ObjectTree as ObjectTree
@@ -52,10 +54,12 @@ _HOME = {
     "ObjectTree": "openvocab_occ.objects.tree",
     "OccupancyGrid": "openvocab_occ.occupancy.grid",
     "PixelEncoder": "openvocab_occ.segmentation.encoder",
+    "Prior": "openvocab_occ.memory.window",
     "RayHits": "openvocab_occ.occupancy.rays",
     "SceneMap": "openvocab_occ.objects.scene_map",
     "SceneObject": "openvocab_occ.objects.tree",
     "TextEncoder": "openvocab_occ.segmentation.encoder",
+    "TileMap": "openvocab_occ.memory.tile_map",
     "View": "openvocab_occ.datasets.frame",
     "VoxelMap": "openvocab_occ.mapping.voxel_map",
     "build_map": "openvocab_occ.pipeline.build",

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
-Keys = Int64[np.ndarray, " n"]
+Keys = Int64[np.ndarray, " _"]
 
 
 @dataclass(frozen=True, kw_only=True)

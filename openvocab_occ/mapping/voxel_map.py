@@ -58,6 +58,11 @@ class VoxelMap:
     def __len__(self) -> int:
         return len(self._packed)
 
+    @property
+    def num_stored(self) -> int:
+        """Voxels, told without sorting them: cheap while the map grows."""
+        return len(self) if self._load else len(self._table)
+
     def __repr__(self) -> str:
         return f"VoxelMap({len(self)} voxels of {self.voxel_size} m, {self.dim} {self.contract} channels)"
 

@@ -14,7 +14,7 @@ TOO_LONG = 1.25
 _SLACK = 0.8  # metres by which voxels make a thing look longer
 
 
-def cut_bridge(packed: Int64[np.ndarray, " n"], name: str, voxel_size: float) -> list[Int64[np.ndarray, " m"]]:
+def cut_bridge(packed: Int64[np.ndarray, " n"], name: str, voxel_size: float) -> list[Int64[np.ndarray, " _"]]:
     """Return the voxels of each thing that a segment of things called `name` is made of, along its length.
 
     A segment is cut at the emptiest cross section that leaves a plausible length of such a thing on both sides and is a

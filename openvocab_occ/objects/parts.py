@@ -19,7 +19,7 @@ MIN_OBJECT = 30
 """Voxels below which a thing is too coarse to show parts."""
 
 
-def find_parts(item: SceneObject, voxels: VoxelMap) -> list[Int64[np.ndarray, " n"]]:
+def find_parts(item: SceneObject, voxels: VoxelMap) -> list[Int64[np.ndarray, " _"]]:
     """Return positions of the voxels of each part, largest first; none where features show fewer than two.
 
     The parts of a thing hold all its voxels.

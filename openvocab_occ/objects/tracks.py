@@ -49,9 +49,9 @@ class Track:
     """True once it moved further than sightings err; its older voxels are then a trail, not the thing."""
     stands: bool = False
     """True while the class evidence says that such a thing cannot move."""
-    bodies: list[Int64[np.ndarray, " n"]] = field(default_factory=list[np.ndarray])
+    bodies: list[Int64[np.ndarray, " _"]] = field(default_factory=list[np.ndarray])
     """Packed keys, hidden ones included, of its latest sightings that show where it ends."""
-    _pieces: list[Int64[np.ndarray, " n"]] = field(default_factory=list[np.ndarray])
+    _pieces: list[Int64[np.ndarray, " _"]] = field(default_factory=list[np.ndarray])
     _compacted: int = 0
 
     @classmethod

@@ -141,7 +141,7 @@ def aligned(a: SceneMap, b: SceneMap) -> Alignment:
     size = a.voxels.voxel_size
     clouds = []
     for scene in (b, a):
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(scene.voxels.centers))
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(scene.voxels.centers.copy()))
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=4 * size, max_nn=30))
         clouds.append(cloud)
     T = np.eye(4)
@@ -149,7 +149,7 @@ def aligned(a: SceneMap, b: SceneMap) -> Alignment:
         result = o3d.pipelines.registration.registration_icp(
             *clouds, reach, T, o3d.pipelines.registration.TransformationEstimationPointToPlane()
         )
-        T = np.asarray(result.transformation)
+        T = np.array(result.transformation)
     back = len(b.voxels) > len(a.voxels)  # judged from the smaller map's side
     source, target = (clouds[1], clouds[0]) if back else (clouds[0], clouds[1])
     pose = np.linalg.inv(T) if back else T

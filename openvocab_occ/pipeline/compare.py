@@ -20,15 +20,15 @@ class MapDiff:
 
     same: int
     """Voxels in both that agree."""
-    changed: Int64[np.ndarray, " n"]
+    changed: Int64[np.ndarray, " c"]
     """Positions in b of voxels in both that look different or are of another class."""
-    appeared: Int64[np.ndarray, " n"]
+    appeared: Int64[np.ndarray, " p"]
     """Positions in b where a had looked through."""
-    vanished: Int64[np.ndarray, " n"]
+    vanished: Int64[np.ndarray, " v"]
     """Positions in a that b looked through."""
-    not_observed_in_a: Int64[np.ndarray, " n"]
+    not_observed_in_a: Int64[np.ndarray, " q"]
     """Positions in b of which a knows nothing: they may have been there all along."""
-    not_observed_in_b: Int64[np.ndarray, " n"]
+    not_observed_in_b: Int64[np.ndarray, " r"]
     """Positions in a of which b knows nothing: they may still be there."""
     shifted: int
     """Voxels of either that the other has a voxel or two beside: the same surface on another side of a face."""

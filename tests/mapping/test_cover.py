@@ -20,7 +20,7 @@ def turned(rng, size, yaw_only=False):
     return OccupancyGrid(np.zeros((9, 8, 6), np.uint8), GridSpec((-1.3, 0.7, -1.0), size, (9, 8, 6)), T)
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.2, 0.4, 0.55]), st.sampled_from([0.1, 0.25, 0.4, 1.0]))
 def test_every_voxel_of_the_map_goes_to_the_grid_voxel_that_holds_its_centre(seed, size, voxel_size):
     rng = np.random.default_rng(seed)
@@ -82,6 +82,7 @@ def test_the_lattice_of_the_grid_itself_covers_one_to_one():
     np.testing.assert_array_equal(cover.keys[np.argsort(cover.row)], keys_of(grid.centers(np.arange(210)), 0.4))
 
 
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([(), (-0.2, 0.05, 0.001, 0.0)]))
 def test_rows_of_measured_depth_are_the_voxels_of_the_points(seed, distortion):
     rng = np.random.default_rng(seed)

@@ -54,9 +54,7 @@ def test_parked_trucks_and_cars_stay(drive):
         if thing.label in (CAR, TRUCK) and not thing.moving:
             at = inside(scene.voxels.centers, thing, 0.0)
             seen += at.sum() > 30
-            assert (
-                scene.voxels.labels[at & (scene.voxels.centers[:, 2] > 0.4)] == thing.label
-            ).mean() > 0.9 or not at.any()
+            assert (scene.voxels.labels[at] != thing.label).sum() <= 0.1 * at.sum()
     assert seen >= 5
     trucks = [thing for thing in street(0).objects if thing.label == TRUCK]
     assert all(inside(scene.voxels.centers, truck, 0.0).sum() > 80 for truck in trucks)
@@ -70,7 +68,7 @@ def test_classes_are_counted_and_normals_face_where_surfaces_do(drive):
     assert (voxels.label_counts.sum(axis=1)[named] <= voxels.count[named]).all()
     road = voxels.label_counts.argmax(axis=1) == frames[0].occupancy.class_names.index("driveable surface")
     assert (voxels.normals[road, 2] > 0.9).mean() > 0.8
-    assert set(voxels.view_frame.tolist() if hasattr(voxels, "view_frame") else []) <= set(range(12))
+    assert set(voxels.columns()["view_frame"].tolist()) <= set(range(12))
 
 
 def test_frames_in_any_order_give_the_same_map(drive):
