@@ -148,7 +148,7 @@ def halved(grid: OccupancyGrid) -> OccupancyGrid:
 def _scene(labels: Path | None) -> tuple[OccupancyGrid, str]:
     if labels is not None:
         return read_occ3d(labels), f"Occ3D {labels.name}"
-    grid = load_sequence("city")[0].occupancy
+    grid = load_sequence("street")[0].occupancy
     assert grid is not None  # the street always has one
     return grid, "synthetic street"
 

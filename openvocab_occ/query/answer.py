@@ -8,7 +8,7 @@ from openvocab_occ.objects.tree import SceneObject
 Verdict = Literal["found", "absent", "unknown words"]
 """`found`: objects reach the threshold. `absent`: the words were understood and no object of the map reaches it.
 `unknown words`: no word was understood, so nothing can be said."""
-ScoreKind = Literal["class probability", "cosine"]
+ScoreKind = Literal["class probability", "cosine", "sigmoid", "relevancy", "probability"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class Answer:
     best: float | None
     """Score of the best object even where it is below the threshold; None where no object was scored."""
     score_kind: ScoreKind
-    """Neither is calibrated: a class probability is what the model's softmax says."""
+    """Only `probability` is calibrated; a class probability is what the model's softmax says."""
     matched: tuple[str, ...] = ()
     """Labels of the map that the words meant; empty for a `dense` map, which reads the text as a whole."""
     unknown: tuple[str, ...] = ()
@@ -52,7 +52,8 @@ class Answer:
             lines.append(f"  this map knows: {', '.join(self.known) or 'no words'}")
         else:
             best = "no object" if self.best is None else f"best {self.best:.2f}"
-            lines.append(f"  score: {self.score_kind}, not calibrated; threshold {self.threshold:.2f}, {best}")
+            trust = "calibrated" if self.score_kind == "probability" else "not calibrated"
+            lines.append(f"  score: {self.score_kind}, {trust}; threshold {self.threshold:.2f}, {best}")
         for rank, hit in enumerate(self.hits, start=1):
             x, y, z = hit.object.center
             length, width, height = hit.object.box.size

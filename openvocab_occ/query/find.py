@@ -12,20 +12,28 @@ from openvocab_occ.errors import ConfigError, EncoderMismatchError, ModelError
 from openvocab_occ.objects.scene_map import SceneMap
 from openvocab_occ.query.answer import Answer as Answer
 from openvocab_occ.query.answer import Hit, ScoreKind, Verdict
-from openvocab_occ.query.words import Match, checked_text, match_labels
+from openvocab_occ.query.words import STOP_WORDS, Match, checked_text, match_labels, text_words
 from openvocab_occ.segmentation.encoder import PixelEncoder
+from openvocab_occ.segmentation.scoring import DEFAULT_THRESHOLD, Scoring, unknown_words
 
 LOGITS_THRESHOLD = 0.5
 """More likely than not, if the model's probabilities could be trusted."""
-DENSE_THRESHOLD = 0.25
-"""Cosine; what matching pairs of CLIP-like models reach. An encoder's own `threshold` goes before it."""
+DENSE_THRESHOLD = DEFAULT_THRESHOLD["cosine"]
+"""For a `dense` encoder without a scoring of its own."""
+_COSINE = Scoring(kind="cosine", threshold=DENSE_THRESHOLD)
 
 
 class _Reading(NamedTuple):
-    """A text as a direction in feature space: score = feature . vector."""
+    """A text as a direction in feature space, and how nearness to it becomes a score."""
 
     vector: Float32[np.ndarray, " c"]
     match: Match
+    scoring: Scoring | None
+    """None for `logits` maps, where score = feature . vector."""
+    understood: bool
+
+    def __call__(self, features: Float32[np.ndarray, "n c"]) -> Float32[np.ndarray, " n"]:
+        return features @ self.vector if self.scoring is None else self.scoring(features, self.vector)
 
 
 def find(
@@ -39,8 +47,9 @@ def find(
     """Rank the objects of a map by how well they fit a text.
 
     In a map of a `logits` encoder the words must be labels or inflections of them; an object scores the mean
-    probability of the labels meant, added up. In a map of a `dense` encoder, which must be passed, it scores the cosine
-    of its embedding and the text's. Equal scores rank by id, larger objects first.
+    probability of the labels meant, added up. In a map of a `dense` encoder, which must be passed, its score comes from
+    the cosine of its embedding and the text's, in the way of the model's card (see `Scoring`). Words that the text
+    encoder does not know are reported. Equal scores rank by id, larger objects first.
 
     Raises QueryError for a text that cannot be read, EncoderMismatchError for another encoder than the map's.
     """
@@ -49,13 +58,14 @@ def find(
         raise ConfigError("limit is not usable", expected="at least 1, or None for all hits", got=limit)
     text = checked_text(text)
     reading = _read(scene, text, encoder)
-    threshold = _threshold(scene, encoder, threshold)
-    known_words = scene.encoder.contract == "dense" or bool(reading.match.channels.any())
-    scored = [Hit(item, float(item.embedding @ reading.vector)) for item in scene.objects] if known_words else []
+    threshold = _threshold(reading.scoring, threshold)
+    things = list(scene.objects) if reading.understood else []
+    scores = reading(np.stack([thing.embedding for thing in things])).tolist() if things else []
+    scored = [Hit(thing, score) for thing, score in zip(things, scores, strict=True)]
     scored.sort(key=lambda hit: (-hit.score, hit.object.id))
     hits = tuple(hit for hit in scored if hit.score >= threshold)
-    verdict: Verdict = "unknown words" if not known_words else "found" if hits else "absent"
-    kind: ScoreKind = "class probability" if scene.encoder.contract == "logits" else "cosine"
+    verdict: Verdict = "unknown words" if not reading.understood else "found" if hits else "absent"
+    kind: ScoreKind = "class probability" if reading.scoring is None else reading.scoring.kind
     return Answer(
         text=text,
         hits=hits[:limit],
@@ -73,7 +83,9 @@ def find(
 
 def score_voxels(scene: SceneMap, text: str, encoder: PixelEncoder | None = None) -> Float32[np.ndarray, " n"]:
     """Return each voxel's score for a text, as `find` scores objects; all zero where no word is understood."""
-    return scene.voxels.features @ _read(scene, checked_text(text), encoder).vector
+    reading = _read(scene, checked_text(text), encoder)
+    features = scene.voxels.features
+    return reading(features) if reading.understood else np.zeros(len(features), dtype=np.float32)
 
 
 def _read(scene: SceneMap, text: str, encoder: PixelEncoder | None) -> _Reading:
@@ -86,7 +98,7 @@ def _read(scene: SceneMap, text: str, encoder: PixelEncoder | None) -> _Reading:
         )
     if scene.encoder.contract == "logits":
         match = match_labels(text, scene.encoder.labels)
-        return _Reading(match.channels.astype(np.float32), match)
+        return _Reading(match.channels.astype(np.float32), match, None, bool(match.channels.any()))
     if encoder is None or encoder.text is None:
         raise ConfigError(
             "this map needs its text encoder to understand words",
@@ -94,6 +106,10 @@ def _read(scene: SceneMap, text: str, encoder: PixelEncoder | None) -> _Reading:
             got="no encoder" if encoder is None else "an encoder without a text side",
             fix="pass it: find(scene, text, encoder)",
         )
+    unknown = unknown_words(encoder.text, [text])
+    match = Match(np.zeros(0, dtype=bool), unknown)
+    if unknown and not set(_spoken(text)) - {word.casefold() for word in unknown}:
+        return _Reading(np.zeros(scene.encoder.dim, dtype=np.float32), match, _COSINE, False)
     vectors = np.asarray(encoder.text.encode([text]), dtype=np.float32)
     if vectors.shape != (1, scene.encoder.dim) or not np.isfinite(vectors).all():
         raise ModelError(
@@ -102,15 +118,18 @@ def _read(scene: SceneMap, text: str, encoder: PixelEncoder | None) -> _Reading:
             got=vectors.shape,
         )
     vector = vectors[0] / max(float(np.linalg.norm(vectors[0])), 1e-12)
-    return _Reading(vector.astype(np.float32), Match(np.zeros(0, dtype=bool)))
+    scoring = getattr(encoder, "scoring", None) or _COSINE
+    return _Reading(vector.astype(np.float32), match, scoring, True)
 
 
-def _threshold(scene: SceneMap, encoder: PixelEncoder | None, asked: float | None) -> float:
+def _spoken(text: str) -> list[str]:
+    """Return the words that say something."""
+    return [word for word in text_words(text) if word not in STOP_WORDS]
+
+
+def _threshold(scoring: Scoring | None, asked: float | None) -> float:
     if asked is not None:
         if not math.isfinite(asked):
             raise ConfigError("threshold is not usable", expected="a finite score", got=asked)
         return float(asked)
-    if scene.encoder.contract == "logits":
-        return LOGITS_THRESHOLD
-    own = getattr(encoder, "threshold", None)  # optional in the protocol: cards may measure one
-    return DENSE_THRESHOLD if own is None else float(own)
+    return LOGITS_THRESHOLD if scoring is None else scoring.threshold

@@ -52,7 +52,7 @@ def checked_text(text: str) -> str:
 
 def match_labels(text: str, labels: Sequence[str]) -> Match:
     """Read a text as labels, longest first; case, hyphens and spaces within a label do not matter."""
-    words = _words(text)
+    words = text_words(text)
     known = _by_form(tuple(labels))
     channels = np.zeros(len(labels), dtype=bool)
     unknown: list[str] = []
@@ -75,7 +75,8 @@ def match_labels(text: str, labels: Sequence[str]) -> Match:
     return Match(channels, tuple(unknown), {word: tuple(found) for word, found in near.items() if found})
 
 
-def _words(text: str) -> list[str]:
+def text_words(text: str) -> list[str]:
+    """Return the words of a text without case, punctuation and compatibility forms."""
     return _WORD.findall(unicodedata.normalize("NFKC", text).casefold())
 
 
@@ -84,7 +85,7 @@ def _by_form(labels: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
     """Map every form of every label to the channels that have it."""
     known: dict[str, tuple[int, ...]] = {}
     for channel, label in enumerate(labels):
-        for form in _forms(_words(label)):
+        for form in _forms(text_words(label)):
             known[form] = (*known.get(form, ()), channel)
     return known
 

@@ -108,7 +108,8 @@ def _split(soup: np.ndarray, column: int, level: float) -> tuple[np.ndarray, np.
 def _flat(plan: Plan, soup: np.ndarray, zone: str) -> Mesh:
     """Return a level surface; the texture of paved zones runs along the nearest street."""
     corners = np.concatenate([soup[:, :, :2], np.full((*soup.shape[:2], 1), _HEIGHTS[zone])], axis=2)
-    size = np.cross(soup[:, 1, :2] - soup[:, 0, :2], soup[:, 2, :2] - soup[:, 0, :2])
+    p, q = soup[:, 1, :2] - soup[:, 0, :2], soup[:, 2, :2] - soup[:, 0, :2]
+    size = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
     corners, soup = corners[size > 1e-9], soup[size > 1e-9]
     uv = soup[:, :, :2].astype(np.float32)
     if zone not in ("terrain", "square"):

@@ -1,6 +1,7 @@
 """Who is on the move during a traversal, and where they go."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -44,6 +45,7 @@ def ego_route(town: Town, route: int) -> list[int]:
     return random_route(town.lanes, start, 420.0, rng)
 
 
+@lru_cache(maxsize=8)
 def set_going(town: Town, route: int, traversal: int, traffic: float) -> tuple[Motion, list[Mover]]:
     """Simulate a traversal; return the ego's motion and everyone else's, time 0 being the first keyframe."""
     rng = np.random.default_rng([town.seed, 42, route, traversal, round(10 * traffic)])

@@ -19,7 +19,7 @@ SIDEWALK_WIDTH = 3.2
 CUT = 15.0
 """Lanes end this far before the middle of a junction, metres."""
 _STEP = 1.0
-_BLEND = 7.0  # metres over which two streets round their corners
+_BLEND = 9.0  # metres over which two streets round their corners
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,8 @@ class Street:
         before, after = self._headings[i], self._headings[i + 1]
         heading = before + (after - before) * np.clip(t, 0, 1)
         left = np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
-        return a + (b - a) * t[..., None] + left * np.asarray(lateral, dtype=np.float64)[..., None], heading
+        points = a + (b - a) * t[..., None] + left * np.asarray(lateral, dtype=np.float64)[..., None]
+        return points, np.asarray(heading)
 
     @cached_property
     def _headings(self) -> np.ndarray:

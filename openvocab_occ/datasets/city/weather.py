@@ -69,16 +69,16 @@ def light_vector(condition: Condition, azimuth: float, drift: float) -> Float[np
 
 def street_light(position: Sequence[float]) -> list[float]:
     """Return the row of a street lamp for the shader."""
-    return [*position, 0, 0, -1, 34, 24, 13, 0.1, 20.0**2]
+    return [*position, 0.0, 0.0, -1.0, 34.0, 24.0, 13.0, 0.1, 20.0**2]
 
 
 def headlights(x: float, y: float, heading: float, *, ahead: float, ego: bool = False) -> list[list[float]]:
     """Return rows for the beams of a vehicle."""
-    c, s = np.cos(heading), np.sin(heading)
+    c, s = float(np.cos(heading)), float(np.sin(heading))
     if not ego:
-        return [[x + ahead * c, y + ahead * s, 0.75, c, s, -0.09, 16, 15, 13, 0.86, 28.0**2]]
+        return [[x + ahead * c, y + ahead * s, 0.75, c, s, -0.09, 16.0, 15.0, 13.0, 0.86, 28.0**2]]
     return [
-        [x + ahead * c - side * s, y + ahead * s + side * c, 0.8, c, s, -0.06, 17, 16.5, 15, 0.84, 42.0**2]
+        [x + ahead * c - side * s, y + ahead * s + side * c, 0.8, c, s, -0.06, 17.0, 16.5, 15.0, 0.84, 42.0**2]
         for side in (-0.7, 0.7)
     ]
 

@@ -34,7 +34,7 @@ def soup(corners: np.ndarray, labels: np.ndarray) -> Triangles:
                      labels.astype(np.uint8), np.arange(1, n + 1, dtype=np.int32), np.zeros(n, np.bool_))  # fmt: skip
 
 
-@given(st.integers(0, 2**31), st.sampled_from([0.3, 2.0, 9.0, 60.0]))
+@given(st.integers(0, 2**31), st.sampled_from([0.3, 2.0, 9.0, 25.0]))
 def test_labels_follow_areas(seed, scale):
     """Where the reference finds a clear winner the voxel has its class; where it finds nothing, it is free."""
     rng = np.random.default_rng(seed)
@@ -44,7 +44,7 @@ def test_labels_follow_areas(seed, scale):
     corners = corners.astype(np.float32).astype(float)
     labels = rng.integers(0, 17, 6)
     found = voxelise(soup(corners, labels), np.eye(4), GRID).semantics
-    area = areas_reference(corners, labels, (8, 8, 8, 17), 40_000 if scale > 5 else 6_000)
+    area = areas_reference(corners, labels, (8, 8, 8, 17), 60_000 if scale > 5 else 6_000)
     assert (area.sum(-1) > 0)[found != OCC3D_FREE].mean() > 0.97 if (found != OCC3D_FREE).any() else True
     order = np.sort(area * WEIGHT, axis=-1)
     clear = (order[..., -1] > 1.5 * order[..., -2]) & (area.sum(-1) > 0.35)
@@ -61,7 +61,7 @@ def test_inside_of_closed_things_matches_open3d():
     b.ball((4, 4, 5), (2.2, 2.4, 2.1), DARK, Part.BODY, level=3)
     b.tube((1, 1, 1), (7, 6, 6.5), 0.8, DARK, Part.BODY)
     mesh = b.mesh()
-    car = Thing(id=5, kind="car", label=LABELS["car"], mesh=mesh, position=(0, 0, 0))
+    car = Thing(id=5, kind="car", label=LABELS["car"], mesh=mesh, position=(0.0, 0.0, 0.0))
     table = gather([car], [np.eye(4)], np.zeros(3), cull=False)
     spec = GridSpec((0.0, 0.0, 0.0), 0.25, (32, 32, 32))
     found = voxelise(table, np.eye(4), spec)
@@ -117,8 +117,6 @@ def test_lidar_hits_are_known_and_occupied(drive, instant, truth):
 def test_instances_have_the_class_of_their_voxel(drive, truth):
     attributes = drive.attributes()
     assert ((truth.instances > 0) == (truth.grid.labels != OCC3D_FREE)).all()
-    label_of = np.array([truth.grid.labels[truth.instances == n] == attributes[n].label for n in []])
-    assert label_of.size == 0
     right = total = 0
     for number in np.unique(truth.instances[truth.instances > 0]):
         own = truth.grid.labels[truth.instances == number]
@@ -153,9 +151,6 @@ def test_a_turned_grid_sees_the_same_world(drive, instant):
 @pytest.mark.parametrize("condition", NOISE)
 def test_oracle_is_right_near_and_wrong_far(truth, condition):
     seen = perceive(truth, condition, seed=3)
-    again = perceive(truth, condition, seed=3)
-    np.testing.assert_array_equal(seen.logits, again.logits)
-    assert not np.array_equal(seen.labels, perceive(truth, condition, seed=4).labels)
     x, y = np.meshgrid(*[np.arange(200) * 0.4 - 39.8] * 2, indexing="ij")
     distance = np.broadcast_to(np.hypot(x, y)[..., None], seen.labels.shape)
     occupied = truth.grid.labels != OCC3D_FREE
@@ -166,8 +161,15 @@ def test_oracle_is_right_near_and_wrong_far(truth, condition):
     assert near > hidden + 0.2
     assert near == pytest.approx(0.97 * NOISE[condition].reach * np.exp(-((8 / NOISE[condition].far) ** 2)), abs=0.06)
     assert seen.logits is not None
-    confident = np.sort(seen.logits, axis=-1)[..., -1] - np.sort(seen.logits, axis=-1)[..., -2]
-    assert confident[right].mean() > confident[~right].mean()
+    best = np.sort(seen.logits[::5, ::5], axis=-1)
+    confident = best[..., -1] - best[..., -2]
+    assert confident[right[::5, ::5]].mean() > confident[~right[::5, ::5]].mean()
+
+
+def test_oracle_repeats_itself(truth):
+    seen = perceive(truth, "clear", seed=3)
+    np.testing.assert_array_equal(seen.logits, perceive(truth, "clear", seed=3).logits)
+    assert not np.array_equal(seen.labels, perceive(truth, "clear", seed=4).labels)
 
 
 def test_oracle_refuses_what_it_does_not_know(truth):

@@ -1,6 +1,7 @@
 """The town is a town: lanes connect, nothing stands on the road, parked vehicles stay, moving ones do not collide."""
 
 from collections import Counter
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -56,9 +57,7 @@ def test_nothing_built_stands_on_the_road(city):
         if thing.label in (LABELS["manmade"], LABELS["vegetation"]) and thing.kind != "tree":
             low, high = thing.mesh.bounds
             foot = np.array([(x, y, 0.0) for x in (low[0], high[0]) for y in (low[1], high[1])])
-            foot = foot[:, :2] if thing.kind in ("street lamp",) else foot[:, :2]
-            if thing.kind == "street lamp":
-                foot = np.zeros((1, 2))
+            foot = np.zeros((1, 2)) if thing.kind == "street lamp" else foot[:, :2]
             T = thing.pose()
             assert city.town.plan.road_distance(foot @ T[:2, :2].T + T[:2, 3]).min() > -0.1, thing.kind
 
@@ -66,7 +65,7 @@ def test_nothing_built_stands_on_the_road(city):
 def test_ways_of_parking(city):
     """Vehicles that stay keep number and place; some come, some go; none overlap."""
     days = [parked(7, list(city.town.spots), city.town.closed, n) for n in range(4)]
-    for before, after in zip(days, days[1:], strict=False):
+    for before, after in pairwise(days):
         a, b = {t.id: t for t in before}, {t.id: t for t in after}
         stayed = a.keys() & b.keys()
         assert len(stayed) > 0.4 * len(a)

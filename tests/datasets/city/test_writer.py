@@ -53,14 +53,15 @@ def test_stopped_and_resumed_equals_one_pass(tree, tmp_path, monkeypatch):
 
 
 def test_tokens_link(tree):
-    rows = {name: table(tree, name) for name in ("scene", "sample", "sample_data", "ego_pose", "calibrated_sensor", "sensor",
-            "log", "map", "category", "attribute", "instance", "sample_annotation", "visibility")}  # fmt: skip
+    names = "scene sample sample_data ego_pose calibrated_sensor sensor log map category attribute instance visibility"
+    rows = {name: table(tree, name) for name in [*names.split(), "sample_annotation"]}
     tokens = {name: {row["token"] for row in own} for name, own in rows.items()}
     assert all(len(tokens[name]) == len(own) for name, own in rows.items())
     for name, key, other in (
         ("scene", "log_token", "log"), ("scene", "first_sample_token", "sample"), ("sample", "scene_token", "scene"),
         ("sample_data", "sample_token", "sample"), ("sample_data", "ego_pose_token", "ego_pose"),
-        ("sample_data", "calibrated_sensor_token", "calibrated_sensor"), ("calibrated_sensor", "sensor_token", "sensor"),
+        ("sample_data", "calibrated_sensor_token", "calibrated_sensor"),
+        ("calibrated_sensor", "sensor_token", "sensor"),
         ("sample_annotation", "sample_token", "sample"), ("sample_annotation", "instance_token", "instance"),
         ("sample_annotation", "visibility_token", "visibility"), ("instance", "category_token", "category"),
         ("instance", "first_annotation_token", "sample_annotation"),
