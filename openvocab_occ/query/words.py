@@ -79,6 +79,12 @@ def _words(text: str) -> list[str]:
     return _WORD.findall(unicodedata.normalize("NFKC", text).casefold())
 
 
+def label_forms(labels: Sequence[str], words: Sequence[str]) -> bool:
+    """Tell whether words, in any inflection, are one of the labels."""
+    known = _by_form(tuple(labels))
+    return any(form in known for form in _forms(words))
+
+
 @lru_cache(maxsize=8)
 def _by_form(labels: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
     """Map every form of every label to the channels that have it."""
