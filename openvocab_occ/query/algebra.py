@@ -40,35 +40,35 @@ class Node(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="o
     """Any part of a query."""
 
 
-class Noun(Node):
+class Noun(Node, frozen=True):
     """Things of a kind, in words: matched with labels or with an embedding, by the map's encoder."""
 
     text: Text
 
 
-class Anything(Node):
+class Anything(Node, frozen=True):
     """Every object."""
 
 
-class Color(Node):
+class Color(Node, frozen=True):
     """Things of a colour, by the colours of their voxels."""
 
     name: Colour
 
 
-class Sized(Node):
+class Sized(Node, frozen=True):
     """Things large or small for their kind: against the median of what the rest of the query leaves."""
 
     name: Size
 
 
-class Material(Node):
+class Material(Node, frozen=True):
     """Things of a material, by their embedding; a map without embeddings of free text does not know it."""
 
     name: Text
 
 
-class Measure(Node):
+class Measure(Node, frozen=True):
     """Things whose box measures so much."""
 
     dimension: Literal["length", "width", "height"]
@@ -76,30 +76,30 @@ class Measure(Node):
     at_most: Metres | None = None
 
 
-class State(Node):
+class State(Node, frozen=True):
     """Things that were seen to move or rest so; undecided for those whose motion was not observed."""
 
     name: Motion
 
 
-class Me(Node):
+class Me(Node, frozen=True):
     """The viewer: ego at a time, or a given viewpoint."""
 
 
-class Place(Node):
+class Place(Node, frozen=True):
     """A point of the world."""
 
     at: Point
 
 
-class Relation(Node):
+class Relation(Node, frozen=True):
     """Things that stand so to an anchor; "between" has two anchors, or one that names several things."""
 
     name: RelationName
     anchors: Annotated[tuple["Query", ...], Meta(min_length=1, max_length=2)]
 
 
-class Within(Node):
+class Within(Node, frozen=True):
     """Things whose gap to an anchor lies between two distances."""
 
     anchor: "Query"
@@ -107,25 +107,25 @@ class Within(Node):
     at_least: Metres = 0.0
 
 
-class Not(Node):
+class Not(Node, frozen=True):
     """Everything else."""
 
     of: "Query"
 
 
-class And(Node):
+class And(Node, frozen=True):
     """What all parts agree on."""
 
     of: Annotated[tuple["Query", ...], Meta(min_length=1, max_length=32)]
 
 
-class Or(Node):
+class Or(Node, frozen=True):
     """What any part holds."""
 
     of: Annotated[tuple["Query", ...], Meta(min_length=1, max_length=32)]
 
 
-class Superlative(Node):
+class Superlative(Node, frozen=True):
     """The n-th most of something, in one order: largest, second tallest, nearest to an anchor, third from the left."""
 
     of: "Query"
@@ -137,51 +137,51 @@ class Superlative(Node):
     anchor: Union["Query", None] = None
 
 
-class Some(Node):
+class Some(Node, frozen=True):
     """The best few."""
 
     of: "Query"
     number: Annotated[int, Meta(ge=1, le=10_000)]
 
 
-class Count(Node):
+class Count(Node, frozen=True):
     """How many there are."""
 
     of: "Query"
 
 
-class Level(Node):
+class Level(Node, frozen=True):
     """Nodes of one level of the tree; without it a query speaks of objects and regions."""
 
     of: "Query"
     level: LevelName
 
 
-class Like(Node):
+class Like(Node, frozen=True):
     """Things that look like an object of the map, itself left out."""
 
     id: Annotated[int, Meta(ge=0)]
 
 
-class Item(Node):
+class Item(Node, frozen=True):
     """One object of the map, by its id."""
 
     id: Annotated[int, Meta(ge=0)]
 
 
-class Vector(Node):
+class Vector(Node, frozen=True):
     """Things near a vector of the encoder's space."""
 
     values: Annotated[tuple[float, ...], Meta(min_length=1, max_length=65536)]
 
 
-class Crop(Node):
+class Crop(Node, frozen=True):
     """Things that look like a picture: PNG or JPEG bytes (base64 in JSON)."""
 
     image: Annotated[bytes, Meta(min_length=8)]
 
 
-class Click(Node):
+class Click(Node, frozen=True):
     """The thing that a ray hits first, and what looks like it."""
 
     origin: Point

@@ -67,7 +67,7 @@ def tokens_of(text: str) -> tuple[str, ...]:
     """Split a text into words, numbers and the few signs that mean something."""
     plain = unicodedata.normalize("NFKC", text).casefold()
     signs = {"-": "not", "−": "not", "–": "not", "+": "plus"}
-    return tuple(signs.get(token, token) for token in _TOKEN.findall(plain))
+    return tuple(signs.get(token, token) for token in map(str, _TOKEN.findall(plain)))
 
 
 class _Reader(Modifiers):
