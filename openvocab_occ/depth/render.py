@@ -2,30 +2,25 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import overload
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Float, Float32, Int, Int32
 
 from openvocab_occ._jit import in_slices
-from openvocab_occ.depth._sampling_kernels import first_samples
+from openvocab_occ.depth._sampling_kernels import first_samples, samples_from_entry
+from openvocab_occ.depth.image import DepthImage as DepthImage
+from openvocab_occ.depth.pixel_rays import PixelRays
+from openvocab_occ.depth.raster import can_raster, raster
 from openvocab_occ.errors import ConfigError
 from openvocab_occ.geometry import Camera
 from openvocab_occ.occupancy import OccupancyGrid
-from openvocab_occ.occupancy.rays import lattice_rays, trace
+from openvocab_occ.occupancy.rays import lattice_rays, trace_lattice
 
 _GRAIN = 2048  # rays worth a thread
 
 
-@dataclass(frozen=True, eq=False)
-class DepthImage:
-    """What a camera sees of a grid."""
-
-    depth: Float32[np.ndarray, "h w"]
-    """z-depth in metres; max_depth where nothing is seen."""
-    voxel: Int32[np.ndarray, "h w"]
-    """Flat C-order index of the voxel that is seen; -1 where there is none."""
+_Pixels = Int[np.ndarray, " pixels"]
 
 
 @overload
@@ -55,9 +50,12 @@ def render_depth(
     _check_length(max_depth, "max_depth")
     if step is not None:
         _check_length(step, "step")
-    if isinstance(camera, Camera):
-        return _render(grid, camera, float(max_depth), step)
-    return [_render(grid, one, float(max_depth), step) for one in camera]
+    cameras = [camera] if isinstance(camera, Camera) else list(camera)
+    if step is None:
+        images = [image for image, _ in _exact(grid, cameras, float(max_depth))]
+    else:
+        images = _sampled(grid, cameras, float(max_depth), float(step))
+    return images[0] if isinstance(camera, Camera) else images
 
 
 def _check_length(value: float, name: str) -> None:
@@ -65,34 +63,77 @@ def _check_length(value: float, name: str) -> None:
         raise ConfigError(f"{name} is not a length", expected="metres above 0", got=value)
 
 
-def _render(grid: OccupancyGrid, camera: Camera, max_depth: float, step: float | None) -> DepthImage:
-    size = (camera.height, camera.width)
-    rays = camera.rays().reshape(-1, 3) @ camera.T_world_cam[:3, :3].T  # (h*w, 3), of z-depth 1
-    if step is None:
-        depth, voxel = trace(grid, camera.position[None], rays, max_depth)
-    else:
-        depth, voxel = _sample(grid, camera.position, rays, max_depth, float(step))
-    return DepthImage(depth.reshape(size), voxel.reshape(size))
+def _exact(grid: OccupancyGrid, cameras: Sequence[Camera], max_depth: float) -> list[tuple[DepthImage, _Pixels | None]]:
+    """Render exact depth, with the pixels in doubt of each camera that was rasterised, None for one that was walked."""
+    views = [PixelRays.of(camera, grid) for camera in cameras]
+    fit = [can_raster(camera, view, grid.occupied) for camera, view in zip(cameras, views, strict=True)]
+    rastered = iter(raster(grid, [view for view, one in zip(views, fit, strict=True) if one], max_depth))
+    images: list[tuple[DepthImage, _Pixels | None]] = []
+    for camera, one in zip(cameras, fit, strict=True):
+        if one:
+            images.append(next(rastered))
+            continue
+        depth, voxel = trace_lattice(grid, *_rays(grid, camera), max_depth)
+        size = (camera.height, camera.width)
+        images.append((DepthImage(depth.reshape(size), voxel.reshape(size)), None))
+    return images
+
+
+def _rays(grid: OccupancyGrid, camera: Camera) -> tuple[Float[np.ndarray, "1 3"], Float[np.ndarray, "n 3"]]:
+    """Return position and pixel rays of z-depth 1 in the lattice."""
+    if camera.lens == "pinhole":
+        view = PixelRays.of(camera, grid)
+        return view.origin[None], view.directions(np.arange(camera.height * camera.width))
+    rays = camera.rays().reshape(-1, 3) @ camera.T_world_cam[:3, :3].T
+    return lattice_rays(grid, camera.position[None], rays)
+
+
+def _sampled(grid: OccupancyGrid, cameras: Sequence[Camera], max_depth: float, step: float) -> list[DepthImage]:
+    """Sample each ray from where it enters a voxel on, and from the camera on where that is in doubt."""
+    count = num_samples(max_depth, step)
+    images: list[DepthImage] = []
+    for camera, (image, doubt) in zip(cameras, _exact(grid, cameras, max_depth * (1.0 + 1e-6)), strict=True):
+        depth, voxel = image.depth.reshape(-1), image.voxel.reshape(-1)
+        if doubt is None:
+            origins, directions = _rays(grid, camera)
+            _sample(grid, origins[0], directions, step, count, depth, voxel)
+        else:
+            _sample_from_entry(grid, PixelRays.of(camera, grid), doubt, step, count, image)
+        depth[voxel < 0] = max_depth
+        images.append(image)
+    return images
+
+
+def _sample_from_entry(
+    grid: OccupancyGrid, view: PixelRays, doubt: _Pixels, step: float, count: int, image: DepthImage
+) -> None:
+    depth, voxel, occupied = image.depth, image.voxel, grid.occupied
+    in_slices(
+        lambda start, stop: samples_from_entry(
+            view.lens, view.R, view.origin, occupied, step, count, start, stop, depth, voxel
+        ),
+        view.size[0],
+    )
+    t, hit = np.empty(len(doubt), np.float32), np.empty(len(doubt), np.int32)
+    _sample(grid, view.origin, view.directions(doubt), step, count, t, hit)
+    depth.reshape(-1)[doubt], voxel.reshape(-1)[doubt] = t, hit
 
 
 def _sample(
     grid: OccupancyGrid,
-    position: Float[np.ndarray, " 3"],
-    rays: Float[np.ndarray, "n 3"],
-    max_depth: float,
+    origin: Float[np.ndarray, " 3"],
+    directions: Float[np.ndarray, "n 3"],
     step: float,
-) -> tuple[Float32[np.ndarray, " n"], Int32[np.ndarray, " n"]]:
-    origins, directions = lattice_rays(grid, position[None], rays)
-    occupied, count = grid.occupied, num_samples(max_depth, step)
-    depth = np.empty(len(rays), dtype=np.float32)
-    voxel = np.empty(len(rays), dtype=np.int32)
+    count: int,
+    out_t: Float32[np.ndarray, " n"],
+    out_voxel: Int32[np.ndarray, " n"],
+) -> None:
+    occupied = grid.occupied
     in_slices(
-        lambda start, stop: first_samples(origins[0], directions, occupied, step, count, start, stop, depth, voxel),
-        len(rays),
+        lambda start, stop: first_samples(origin, directions, occupied, step, count, start, stop, out_t, out_voxel),
+        len(directions),
         grain=_GRAIN,
     )
-    depth[voxel < 0] = max_depth
-    return depth, voxel
 
 
 def num_samples(max_depth: float, step: float) -> int:

@@ -4,11 +4,12 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 
 from openvocab_occ.arrays import ArrayLike, check_finite, check_shape
 from openvocab_occ.errors import GridError, ShapeError
 from openvocab_occ.geometry import GridSpec, as_pose, transform
+from openvocab_occ.occupancy.faces import exposed_faces
 
 OCC3D_CLASSES: tuple[str, ...] = (
     "others", "barrier", "bicycle", "bus", "car", "construction vehicle", "motorcycle", "pedestrian", "traffic cone",
@@ -105,6 +106,11 @@ class OccupancyGrid:
         """True where a ray stops: known and not free."""
         occupied = self.labels != self.free_label
         return occupied if self.known is None else occupied & self.known
+
+    @cached_property
+    def faces(self) -> Int32[np.ndarray, "n 6"]:
+        """The surface of what is occupied, as rectangles; see `exposed_faces`. Made once, on first use."""
+        return exposed_faces(self.occupied)
 
     def centers(self, flat: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
         """Return the centres of voxels given by flat index, metres in the world, float64."""

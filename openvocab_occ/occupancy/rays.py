@@ -79,7 +79,13 @@ def trace(
 
     With directions (x, y, 1) of a camera, t is the z-depth. Inputs are not checked; see `cast_rays` for the rules.
     """
-    starts, steps = lattice_rays(grid, origins, directions)
+    return trace_lattice(grid, *lattice_rays(grid, origins, directions), t_max)
+
+
+def trace_lattice(
+    grid: OccupancyGrid, starts: Float[np.ndarray, "n_or_1 3"], steps: Float[np.ndarray, "n 3"], t_max: float
+) -> tuple[Float32[np.ndarray, " n"], Int32[np.ndarray, " n"]]:
+    """Do as `trace` for rays that are in units of voxels."""
     t = np.empty(len(steps), dtype=np.float32)
     voxel = np.empty(len(steps), dtype=np.int32)
     occupied = grid.occupied
