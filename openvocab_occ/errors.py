@@ -76,5 +76,9 @@ class AlreadyExistsError(OpenVocabOccError, FileExistsError):
     """An output that would overwrite something it should not."""
 
 
+class StorageError(OpenVocabOccError, OSError):
+    """A file that could not be written: the disk is full, or may not be written to."""
+
+
 class MissingExtraError(OpenVocabOccError, ImportError):
     """An optional dependency that is not installed."""

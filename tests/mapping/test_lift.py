@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from openvocab_occ.depth.render import render_depth
 from openvocab_occ.errors import DataError, ShapeError
 from openvocab_occ.geometry import Camera, GridSpec, look_at, pose
-from openvocab_occ.mapping import join, keys_of, lift, rows_from_depth, rows_from_grid
+from openvocab_occ.mapping import cover_grid, join, keys_of, lift, rows_from_depth, rows_from_grid
 from openvocab_occ.mapping._lift_reference import lift_reference
 from openvocab_occ.mapping.keys import pack, unpack
 from openvocab_occ.occupancy import OccupancyGrid
@@ -111,21 +111,24 @@ def wall_scene(turn=0.0):
 def test_grid_and_measured_depth_find_the_same_wall():
     grid, camera = wall_scene()
     image = render_depth(grid, camera, max_depth=30.0)
-    rows, keys, labels = rows_from_grid(image, grid, 0.5)
-    assert (labels == 15).all()
+    rows, flat = rows_from_grid(image, grid)
+    assert (grid.labels.reshape(-1)[flat] == 15).all()
     assert (rows >= 0).all()
+    cover = cover_grid(flat, grid, 0.5)
+    assert (cover.share == 1).all()
+    keys = cover.keys[np.argsort(cover.row)]
     # depth just inside the voxels, as a sensor with a small bias would give
     rows2, keys2 = rows_from_depth(image.depth + np.float32(0.001), camera, 0.5)
     np.testing.assert_array_equal(keys[rows], keys2[rows2])
 
 
-def test_rows_point_at_the_voxel_each_pixel_sees_in_a_turned_grid():
+def test_rows_name_the_voxel_that_each_pixel_sees():
     grid, camera = wall_scene(turn=0.6)
-    image = render_depth(grid, camera, max_depth=30.0)
-    rows, keys, _ = rows_from_grid(image, grid, 0.5)
+    image = render_depth(grid, camera, max_depth=6.0)
+    rows, flat = rows_from_grid(image, grid)
     hit = image.voxel >= 0
     np.testing.assert_array_equal(rows >= 0, hit)
-    np.testing.assert_array_equal(keys[rows[hit]], np.floor(grid.centers(image.voxel[hit]) / 0.5))
+    np.testing.assert_array_equal(flat[rows[hit]], image.voxel[hit])
 
 
 def test_measured_depth_that_is_none_adds_nothing():
