@@ -24,7 +24,7 @@ def seconds(work: Callable[[], object]) -> float:
 
 
 def main() -> None:
-    frames = list(load_sequence("city"))
+    frames = list(load_sequence("street"))
     encoder = load_encoder(demo_model())
     builder = MapBuilder(encoder)
     stages: dict[str, list[float]] = {"depth": [], "segmenter": [], "depth, segmenter, lift and fuse": []}

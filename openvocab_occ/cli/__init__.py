@@ -17,6 +17,7 @@ class Command(NamedTuple):
 
 COMMANDS = {
     "demo": Command("demo:demo", "build, ask, export and show the map of a synthetic street"),
+    "city": Command("city:city", "write a made-up town, driven many times, as a nuScenes tree"),
     "map": Command("map:build", "turn a drive and an ONNX model into a map"),
     "find": Command("find:find", "ask a map for things in words"),
     "view": Command("view:view", "show a map in the web browser"),

@@ -28,7 +28,7 @@ def demo(*, out: Path = Path("out/demo"), no_view: bool = False, port: int = 808
     started = time.perf_counter()
     encoder = load_encoder(demo_model())
     with progress("mapping a synthetic street") as advance:
-        scene = build_map(load_sequence("city"), encoder, progress=advance)
+        scene = build_map(load_sequence("street"), encoder, progress=advance)
     path = out / "street.ovmap"
     scene.save(path)
     answer = find(scene, QUESTION, encoder)

@@ -14,9 +14,9 @@ class Source:
     """A drive on disk."""
 
     kind: Annotated[str, tyro.conf.Positional]
-    """How the drive is stored: nuscenes-infos, city."""
+    """How the drive is stored: nuscenes-infos, city, street."""
     path: Annotated[str, tyro.conf.Positional]
-    """Its folder or file; for the city, any name."""
+    """Its folder or file; for the city and the street, any name."""
     scene: str | None = None
     """One scene of a source that holds several."""
     occupancy: str | None = None
@@ -30,7 +30,7 @@ class Source:
         """Open the drive."""
         from openvocab_occ.datasets.registry import load_sequence
 
-        root = None if self.kind == "city" else Path(self.path)
+        root = None if self.kind in ("city", "street") else Path(self.path)
         sequence = load_sequence(
             self.kind, root, scene=self.scene, occupancy=self.occupancy, occupancy_frame=self.occupancy_frame
         )

@@ -13,8 +13,9 @@ from openvocab_occ.io.files import PathLike
 from openvocab_occ.occupancy import OCC3D_CLASSES, OCC3D_SPEC
 
 READERS = {
-    "city": "openvocab_occ.datasets.street:load_street",
+    "city": "openvocab_occ.datasets.city.sequence:load_city",
     "nuscenes-infos": "openvocab_occ.datasets.nuscenes_infos:load_infos",
+    "street": "openvocab_occ.datasets.street:load_street",
 }
 """What reads each kind: `module:function`, called as function(root, scene=..., **options)."""
 
@@ -34,10 +35,11 @@ def load_sequence(
     """Open a drive; its frames are read when they are asked for.
 
         load_sequence("nuscenes-infos", "keyframe/", occupancy="preds/{token}.npz")
-        load_sequence("city", seed=0, frames=8)
+        load_sequence("city", seed=7, route=0, traversal=1, condition="rain", frames=8)
 
     Args:
-        kind: `nuscenes-infos` (mmdetection3d v1.1 info files) or `city` (a made-up street; options `seed`, `frames`).
+        kind: `nuscenes-infos` (mmdetection3d v1.1 info files), `city` (a made-up town; options `seed`, `route`, `traversal`,
+            `condition`, `frames`, `size`) or `street` (a small made-up street; options `seed`, `frames`).
         root: File or folder of the drive.
         scene: Which drive, where the root holds several.
         occupancy: Your own predictions: a file name with {token}, {index}, {scene} or {timestamp}, relative to the

@@ -136,12 +136,12 @@ def load_street(
 ) -> FrameSequence:
     """Drive along a made-up street at 5 m/s, two frames a second; times count from the start."""
     if root is not None or scene is not None:
-        raise ConfigError("city is made up from a seed", expected="no root and no scene", got=root or scene)
+        raise ConfigError("street is made up from a seed", expected="no root and no scene", got=root or scene)
     if not 1 <= frames <= MAX_FRAMES:
         raise ConfigError("the street is too short", expected=f"1 to {MAX_FRAMES} frames", got=frames)
     place = street(seed)
     name = f"synthetic-street-{seed}"
-    return FrameSequence(name, range(frames), lambda index: _frame(place, index), source="city", synthetic=True)
+    return FrameSequence(name, range(frames), lambda index: _frame(place, index), source="street", synthetic=True)
 
 
 def ego_pose(time: float) -> Float[np.ndarray, "4 4"]:

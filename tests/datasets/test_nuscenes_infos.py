@@ -179,6 +179,6 @@ def test_scenes_and_cameras_by_name(write):
     with pytest.raises(ConfigError, match="nuscenes-infos has no option 'fast': expected cameras"):
         load_sequence("nuscenes-infos", folder, fast=True)
     with pytest.raises(
-        ConfigError, match="kind of sequence is not known: expected city or nuscenes-infos, got 'kitty'"
+        ConfigError, match="kind of sequence is not known: expected city or nuscenes-infos or street, got 'kitty'"
     ):
         load_sequence("kitty", folder)

@@ -35,13 +35,13 @@ def test_boxes_hold_their_voxels_exactly(seed):
 
 def test_seeds_differ_and_repeat():
     assert street(3).objects == street(3).objects != street(4).objects
-    a, b = (load_sequence("city", seed=3)[2] for _ in range(2))
+    a, b = (load_sequence("street", seed=3)[2] for _ in range(2))
     np.testing.assert_array_equal(a.views[1].image, b.views[1].image)
 
 
 def test_window_agrees_with_the_world():
     place = street(0)
-    sequence = load_sequence("city", frames=9)
+    sequence = load_sequence("street", frames=9)
     for index in (0, 8):
         frame = sequence[index]
         np.testing.assert_array_equal(frame.T_world_ego, ego_pose(frame.timestamp))
@@ -64,7 +64,7 @@ def test_window_agrees_with_the_world():
 def test_images_show_the_world():
     """Where the ray of a pixel hits a class, the nearest colour of the palette is mostly that class's."""
     place = street(0)
-    frame = load_sequence("city")[4]
+    frame = load_sequence("street")[4]
     assert len(frame.views) == 6
     world = place.world(frame.timestamp)
     colors = np.array(list(PALETTE.values()), dtype=float)
@@ -79,7 +79,7 @@ def test_images_show_the_world():
 
 
 def test_the_car_moves_and_trucks_stay():
-    frames = list(load_sequence("city", frames=6))
+    frames = list(load_sequence("street", frames=6))
     assert [frame.timestamp for frame in frames] == [0, 0.5, 1, 1.5, 2, 2.5]
     place = street(0)
     assert place.world(0.0).labels.sum() != 0
@@ -93,6 +93,6 @@ def test_the_car_moves_and_trucks_stay():
 
 def test_bad_options(tmp_path):
     with pytest.raises(ConfigError, match="the street is too short: expected 1 to 20 frames, got 50"):
-        load_sequence("city", frames=50)
+        load_sequence("street", frames=50)
     with pytest.raises(ConfigError, match="made up from a seed"):
-        load_sequence("city", tmp_path)
+        load_sequence("street", tmp_path)

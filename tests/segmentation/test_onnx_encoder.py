@@ -320,7 +320,7 @@ def test_demo_model_knows_the_street():
     for channel, found in enumerate(encoder.encode(flat)):
         assert found.cells.shape == (2, 2, len(PALETTE))
         assert (found.cells.argmax(axis=-1) == channel).all()
-    view = load_sequence("city")[0].views[0]
+    view = load_sequence("street")[0].views[0]
     cells = encoder.encode([view.image])[0].cells.argmax(axis=-1)
     assert encoder.labels[cells[-1].min()] == "driveable surface"  # in front of the car
     assert encoder.labels[cells[0, 40]] == "sky"
