@@ -116,6 +116,9 @@ class Modifiers(Tokens):
         if anchor is None:
             if viewer:
                 return q.Relation(viewer.meaning, (q.Me(),))  # pyright: ignore[reportArgumentType]
+            following = self._shared_anchor(here.meaning)
+            if following is not None:  # behind and left of the bus
+                return following
             self.unread.extend(said)
             return q.Anything()
         if said == ("crossing",):
@@ -123,6 +126,16 @@ class Modifiers(Tokens):
         relation = here.meaning
         parts = anchor.of if isinstance(anchor, q.And) and _all_things(anchor) else (anchor,)
         return q.conjunction(*(q.Relation(relation, (part,)) for part in parts))  # pyright: ignore[reportArgumentType]
+
+    def _shared_anchor(self, name: str) -> Node | None:
+        joint = self.peek(lex.AND)
+        if joint is None or not self.peek(lex.RELATIONS, joint.length):
+            return None
+        self.pos += joint.length
+        other = self._relation()
+        if isinstance(other, q.Relation):
+            return q.conjunction(q.Relation(name, other.anchors), other)  # pyright: ignore[reportArgumentType]
+        return other
 
     def _between(self, said: lex.Words) -> Node:
         first = self.phrase(anchor=True)
@@ -182,6 +195,7 @@ class Modifiers(Tokens):
         if anchor is None:
             self.pos = back
             return phrase, None
+        anchor = q.disjunction(*anchor.of) if isinstance(anchor, q.And) and _all_things(anchor) else anchor
         return replace(phrase, order=(by, rank, anchor)), q.Anything()
 
     def _like(self) -> Node | None:
@@ -212,6 +226,7 @@ class Modifiers(Tokens):
             self.pos += 1
             anchor = self.anchors()
             self.pos = self.pos if anchor else back
+        anchor = q.disjunction(*anchor.of) if isinstance(anchor, q.And) and _all_things(anchor) else anchor
         return q.Within(anchor or q.Me(), found.high, found.low)  # pyright: ignore[reportArgumentType]
 
     def _ends_noun(self, begun: bool) -> bool:

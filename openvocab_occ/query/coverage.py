@@ -33,10 +33,13 @@ class Coverage:
 def _free_places(scene: SceneMap) -> list[Float[np.ndarray, "n 2"]]:
     """Return where space was seen to be free, where the map keeps that."""
     free = getattr(scene.voxels, "free", None)
-    if free is None:
+    if free is None or not len(free):
         return []
-    keys, counts = free.blocks()
-    return [(np.unique(keys[counts.any(axis=1)][:, :2], axis=0) + 0.5) * free.edge_length]
+    keys, counts = free.blocks
+    edge = round(counts.shape[1] ** (1 / 3))
+    open_columns = counts.reshape(-1, edge, edge, edge).any(axis=3)
+    block, x, y = np.nonzero(open_columns)
+    return [((keys[block, :2] * edge + np.stack([x, y], axis=1)) + 0.5) * free.cell]
 
 
 def _packed(places: Float[np.ndarray, "n 2"]) -> Int64[np.ndarray, " n"]:

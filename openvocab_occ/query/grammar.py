@@ -110,7 +110,8 @@ class _Reader(Modifiers):
             phrase = self.phrase()
             if phrase is not None:
                 phrases.append(phrase)
-            while self.take(lex.EXCEPT):
+            all_things = phrase is not None and phrase.build() == q.Anything()
+            while self.take(lex.EXCEPT) or (all_things and self.take(lex.BUT)):
                 out = self.phrase()
                 if out is not None:
                     excluded.append(q.Not(out.build()))  # pyright: ignore[reportArgumentType]
@@ -119,8 +120,9 @@ class _Reader(Modifiers):
         if not phrases:
             return q.conjunction(*excluded) if excluded else None
         phrases = shared(phrases)
-        wanted = [p.build() for p in phrases if not p.negated]
-        refused = [p.build() for p in phrases if p.negated]
+        built = [p.build() for p in phrases]
+        wanted = [query for query in built if not isinstance(query, q.Not)]
+        refused = [query for query in built if isinstance(query, q.Not)]
         return q.conjunction(*([q.disjunction(*wanted)] if wanted else []), *refused, *excluded)
 
     def _joint(self) -> bool:

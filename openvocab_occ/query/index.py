@@ -15,6 +15,7 @@ from openvocab_occ.query.relations import Anchor, Columns
 
 _SPREAD_OUT = 0.5
 """Share of its box's footprint that a thing must fill to be compared by its box."""
+_AT_ONCE = 1 << 16  # bounds the memory of naming colours
 _SMALL = 9.0
 """Square metres below which a box always does."""
 
@@ -28,7 +29,7 @@ class Index:
         self.boxes = Boxes.of(self.nodes)
         self.levels = np.array([node.level for node in self.nodes], dtype="U8")
         self.states = np.array([node.state for node in self.nodes], dtype="U8")
-        self._colors, self._color_weight = scene.voxels.colors, scene.voxels.columns()["color_weight"]
+        self._voxels = scene.voxels
         self._voxel_size = scene.voxels.voxel_size
         self._dim = scene.voxels.dim
         self._anchors: dict[int, Anchor] = {}
@@ -48,10 +49,15 @@ class Index:
         return {int(id): row for row, id in enumerate(self.ids)}
 
     @cached_property
+    def _colors(self) -> UInt8[np.ndarray, "v 3"]:
+        return self._voxels.colors
+
+    @cached_property
     def voxel_color_names(self) -> UInt8[np.ndarray, " v"]:
         """Position in `colors.NAMES` of each voxel's colour; 255 where no image gave one."""
-        names = colors.names_of(np.ascontiguousarray(self._colors)) if len(self._colors) else np.zeros(0, np.uint8)
-        return np.where(self._color_weight > 0, names, 255).astype(np.uint8)
+        parts = [slice(at, at + _AT_ONCE) for at in range(0, len(self._colors), _AT_ONCE)]
+        names = np.concatenate([colors.names_of(self._colors[part]) for part in parts] or [np.zeros(0, np.uint8)])
+        return np.where(self._colors.any(axis=1), names, 255).astype(np.uint8)  # black is where no image gave one
 
     def color_degrees(
         self, name: str, rows: Int64[np.ndarray, " m"]
@@ -60,7 +66,7 @@ class Index:
         degree, known = np.zeros(len(rows)), np.zeros(len(rows), dtype=bool)
         for i, row in enumerate(rows):
             voxels = self.nodes[row].voxels
-            seen = voxels[self._color_weight[voxels] > 0]
+            seen = voxels[self.voxel_color_names[voxels] != 255]
             known[i] = len(seen) > 0
             if not known[i]:
                 continue

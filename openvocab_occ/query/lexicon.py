@@ -39,7 +39,8 @@ behind: behind, in back of, at the back of, to the rear of
 left of: left of, to the left of, on the left of, on the left side of, on the left hand side of, at the left of
 right of: right of, to the right of, on the right of, on the right side of, on the right hand side of, at the
     right of
-facing: facing, looking at, pointing at, pointing to, oriented towards, oriented toward, facing towards, facing
+facing: facing, towards, toward,
+    looking at, pointing at, pointing to, oriented towards, oriented toward, facing towards, facing
     toward
 """)
 VIEWER_RELATIONS = _table("""
@@ -145,7 +146,6 @@ ORDINALS = {
         ["first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth"], start=1
     )
 }
-# fmt: skip
 ME = _table("""
 me: me, us, myself, here, my car, our car, my vehicle, our vehicle, my position, my location, ego, the ego, ego
     vehicle, the ego vehicle, ego car, the ego car, the viewer, the camera, the robot, you
@@ -170,12 +170,13 @@ like: like, similar to, resembling, look like, looks like, looking like, same as
     to, just like
 """)
 OPENINGS = _table("""
-find: find, show, show me, find me, give me, list, locate, highlight, search, search for, look for, looking for,
+find: hello, hi, ok,
+    find, show, show me, find me, give me, list, locate, highlight, search, search for, look for, looking for,
     i am looking for, i m looking for, get, get me, point out, where is, where are, where s, which, what is,
     what s, what are, is there, are there, do you see, can you see, can you find, can you show me, could you
     find, i want, i want to see, i need, please, hey, tell me, tell me about, display, select, detect, identify,
     is, are, do you know where, take me to, go to, bring me to
-""")  # fmt: skip
+""")
 NEGATIONS = _table("not: not, no, non, never, n t, isn t, aren t, isnt, arent, neither, nor, is not, are not, don t")
 EXCEPT = _table("except: except, except for, but not, but no, excluding, other than, apart from, minus, not including")
 LACKING = _table("without: without, lacking, with no")

@@ -75,15 +75,15 @@ class Columns:
     def near(self, points: Float[np.ndarray, "n k 2"]) -> tuple[Float64[np.ndarray, "n k"], np.ndarray]:
         """Return the distance from points of the ground to the nearest column's middle, less half a voxel; and it."""
         distance, at = self._tree.query(points)
-        return np.maximum(distance - self.half, 0.0), at
+        return np.maximum(distance - self.half, 0.0), np.asarray(at)
 
 
-def falling(value: Float[np.ndarray, " n"], full: float, zero: float) -> Float64[np.ndarray, " n"]:
+def falling(value: Float[np.ndarray, "*n"], full: float, zero: float) -> Float64[np.ndarray, "*n"]:
     """Return 1 up to `full`, 0 from `zero`, a straight line between."""
     return np.clip((zero - np.asarray(value, dtype=np.float64)) / (zero - full), 0.0, 1.0)
 
 
-def rising(value: Float[np.ndarray, " n"], zero: float, full: float) -> Float64[np.ndarray, " n"]:
+def rising(value: Float[np.ndarray, "*n"], zero: float, full: float) -> Float64[np.ndarray, "*n"]:
     """Return 0 up to `zero`, 1 from `full`, a straight line between."""
     return np.clip((np.asarray(value, dtype=np.float64) - zero) / (full - zero), 0.0, 1.0)
 

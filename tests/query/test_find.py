@@ -8,7 +8,8 @@ from openvocab_occ.errors import ConfigError, EncoderMismatchError, ModelError, 
 from openvocab_occ.mapping import Lifted, VoxelMap
 from openvocab_occ.objects import EncoderInfo, SceneMap, group_objects
 from openvocab_occ.query import score_voxels
-from openvocab_occ.query.find import DENSE_THRESHOLD, find
+from openvocab_occ.query.find import find
+from openvocab_occ.query.scoring import DENSE_THRESHOLD
 from openvocab_occ.query.words import match_labels
 
 LABELS = ("road", "curb", "truck", "traffic cone", "bus", "person")
