@@ -18,6 +18,7 @@ from openvocab_occ.query.coverage import coverage_of
 from openvocab_occ.query.evaluate import HALF, Clause, Evaluator
 from openvocab_occ.query.grammar import Parse, parse
 from openvocab_occ.query.lexicon import vocabulary
+from openvocab_occ.query.llm import LanguageModel
 from openvocab_occ.query.reading import reading_of
 from openvocab_occ.query.region import share_seen
 from openvocab_occ.query.relations import Viewpoint
@@ -37,6 +38,7 @@ def find(
     limit: int | None = None,
     threshold: float | None = None,
     viewpoint: Seen = None,
+    language_model: LanguageModel | None = None,
 ) -> Answer:
     """Find the objects of a map that fit a text, or a query of the algebra.
 
@@ -46,7 +48,7 @@ def find(
     measured on the map. Words that are not understood are reported and have no effect. Equal scores rank by id.
 
     `threshold` is the least score of a noun, by default the card's. `viewpoint` is where left, right, in front, behind
-    and "me" are said from.
+    and "me" are said from. A `language_model` reads texts instead of the grammar, where its replies are valid.
 
     Raises QueryError for a query that cannot be read, EncoderMismatchError for another encoder than the map's.
     """
@@ -54,7 +56,7 @@ def find(
     if limit is not None and limit < 1:
         raise ConfigError("limit is not usable", expected="at least 1, or None for all hits", got=limit)
     scorer = Scorer(scene, encoder, threshold)
-    parsed = parsed_query(scene, query)
+    parsed = parsed_query(scene, query, language_model)
     viewer = viewpoint_of(scene, viewpoint)
     evaluator = Evaluator(scene, scorer, viewer)
     clause = None if parsed.query is None else evaluator.evaluate(parsed.query)
@@ -99,10 +101,12 @@ def score_voxels(
     return _Voxels(scene, Evaluator(scene, scorer, viewpoint_of(scene, viewpoint))).score(parsed.query)
 
 
-def parsed_query(scene: SceneMap, query: str | Node) -> Parse:
+def parsed_query(scene: SceneMap, query: str | Node, language_model: LanguageModel | None = None) -> Parse:
     """Read a text with the map's labels in mind, or check a query."""
     if isinstance(query, Node):
         return Parse(query=q.checked(query))
+    if language_model is not None:
+        return language_model.parse(query, scene.encoder.labels)
     return parse(query, scene.encoder.labels)
 
 

@@ -189,7 +189,7 @@ filler: a, an, the, any, some, all, every, each, this, that, these, those, there
     very, visible, seen, located, situated, placed, positioned, found, you, me, my, in the scene, in this scene,
     in the map, in this map, on the map, in the picture, in the image, several, multiple, many, few, a few,
     various, different, of them, of those, do, does, did, can, could, we, i, have, has, colored, coloured, in
-    color, in colour, in total, in all, around here, only, so, exactly, directly, right, of the
+    color, in colour, in total, in all, around here, only, so, exactly, directly,  of the
 """)
 """Words without a meaning of their own here."""
 POSTURES = _table("posture: standing, sitting, lying, hanging, stood, set, resting, sat")
