@@ -22,6 +22,8 @@ COMMANDS = {
     "find": Command("find:find", "ask a map for things in words"),
     "view": Command("view:view", "show a map in the web browser"),
     "export": Command("export:export", "render a semantic view of a map for a person or a model"),
+    "eval grounding": Command("grounding:grounding", "judge answers about the demo city against its truth"),
+    "bench query": Command("grounding:bench_query", "time queries against plain matrix products"),
     "eval keyframe": Command("evaluate:keyframe", "judge depth and answers by the LiDAR of a real keyframe"),
 }
 

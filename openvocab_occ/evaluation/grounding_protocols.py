@@ -99,7 +99,8 @@ def matched_classes(scene: LabelledScene, protocol: Protocol) -> Int[np.ndarray,
     from scipy.spatial import KDTree
 
     count = 5 if protocol.points == "majority of 5" else 1
-    distance, at = KDTree(scene.found_points).query(scene.points, k=[*range(1, min(count, len(scene.found)) + 1)])
+    distance, at = KDTree(scene.found_points).query(scene.points, k=min(count, len(scene.found)))
+    distance, at = (np.asarray(column).reshape(len(scene.points), -1) for column in (distance, at))
     classes = scene.found[at]
     if count > 1:
         best, votes = np.full(len(classes), -1), np.zeros(len(classes), dtype=np.int64)

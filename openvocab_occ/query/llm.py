@@ -1,8 +1,8 @@
 """Questions that the grammar cannot read, rewritten into the algebra by a language model. Off unless asked for.
 
-Any endpoint that speaks OpenAI's chat completions will do; the text, the schema and the map's labels are sent. The reply
-must be JSON that the schema accepts: it is data, checked like a query from anywhere else, and never run. Whatever goes
-wrong, the grammar's own reading is the answer, with a note that says why.
+Any endpoint that speaks OpenAI's chat completions will do; the text, the schema and the map's labels are sent. The
+reply must be JSON that the schema accepts: it is data, checked like a query from anywhere else, and never run. Whatever
+goes wrong, the grammar's own reading is the answer, with a note that says why.
 """
 
 import json
