@@ -26,14 +26,13 @@ def grounding(*, seeds: tuple[int, ...] = (100, 101), json: bool = False) -> Non
     scores = summarize(outcomes)
     if json:
         report = {name: asdict(score) for name, score in scores.items()}
-        print_json(
-            {"seeds": list(seeds), "synthetic": True, "map": "truth", "ece": calibration_of(outcomes), "scores": report}
-        )
+        facts = {"seeds": list(seeds), "synthetic": True, "map": "truth", "ece": calibration_of(outcomes)}
+        print_json({**facts, "scores": report})
         return
     table = Table("category", "questions", "Acc@.25", "mAP", "verdict", "count", "within one", "false found", box=None)
     for name, score in scores.items():
-        shares = (score.accuracy["0.25"], score.mean_precision, score.verdicts, score.count_exact, score.count_within_one,
-                  score.false_found)  # fmt: skip
+        counts = (score.count_exact, score.count_within_one, score.false_found)
+        shares = (score.accuracy["0.25"], score.mean_precision, score.verdicts, *counts)
         table.add_row(name, str(score.questions), *(f"{share:.1%}" for share in shares))
     console().print(f"maps of the truth of the synthetic city, seeds {', '.join(map(str, seeds))}")
     console().print(table)
@@ -55,8 +54,7 @@ def bench_query(*, voxels: int = 1_000_000, dim: int = 512, objects: int = 100_0
         print_json(asdict(times) | {"ratio": times.ratio})
         return
     out = console()
-    out.print(
-        f"scoring {voxels:,} voxels of {dim}: {times.score * 1e3:.0f} ms, {times.ratio:.2f} x torch ({times.threads} threads)"
-    )
+    took = f"{times.score * 1e3:.0f} ms, {times.ratio:.2f} x torch ({times.threads} threads)"
+    out.print(f"scoring {voxels:,} voxels of {dim}: {took}")
     for name in ("find_noun", "find_parked", "find_relation"):
         out.print(f"{name.replace('_', ' ')} among {objects:,} objects: {getattr(times, name) * 1e3:.1f} ms")

@@ -81,8 +81,8 @@ def _crowd(count: int, rng: np.random.Generator) -> SceneMap:
     states = np.array(["parked", "moving", "unknown"])[rng.integers(0, 3, count)]
     nodes = [
         SceneObject(
-            id=i + 1, label=labels[kinds[i]], score=1.0, box=Box(centers[i], np.array([4.0, 2.0, 2.0]), 0.3), voxels=none,
-            points=points, embedding=eye[kinds[i]], state=str(states[i]), parent=0,
+            id=i + 1, label=labels[kinds[i]], score=1.0, box=Box(centers[i], np.array([4.0, 2.0, 2.0]), 0.3),
+            voxels=none, points=points, embedding=eye[kinds[i]], state=str(states[i]), parent=0,
         )
         for i in range(count)
     ]  # fmt: skip
