@@ -254,10 +254,9 @@ class Evaluator:
         raise QueryError("query cannot be evaluated here", got=reading_of(query))
 
     def _state(self, name: str) -> Clause:
-        states = self.index.states
         wanted = _STILL if name == "still" else (name,)
-        fits = np.isin(states, wanted).astype(np.float64)
-        blind = states == "unknown"
+        fits = self.index.in_states(wanted).astype(np.float64)
+        blind = self.index.in_states(("unknown",))
         if blind.all() and len(blind) and self._depth == 0:
             self.report.notes.append(f"nothing was observed about motion, so nothing is known to be {name}")
         return Clause(fits, np.where(blind, 1.0, fits), np.where(blind, 0.5, fits))
@@ -345,7 +344,7 @@ class Evaluator:
         return size.prod(axis=1) if name == "volume" else size[:, ("length", "width", "height").index(name)]
 
     def _on_level(self) -> Bool[np.ndarray, " n"]:
-        return np.isin(self.index.levels, list(self._levels))
+        return self.index.on_levels(self._levels)
 
     def _masked(self, clause: Clause) -> Clause:
         on = self._on_level()
@@ -363,7 +362,7 @@ class Evaluator:
         voxels = self.scene.voxels
         hit = first_voxel(voxels.centers, voxels.voxel_size, origin, direction)
         rows = [row for row, node in enumerate(self.index.nodes) if hit is not None and hit in node.voxels]
-        rows = [row for row in rows if self.index.levels[row] in DEFAULT_LEVELS] or rows
+        rows = [row for row in rows if self.index.nodes[row].level in DEFAULT_LEVELS] or rows
         if not rows:
             raise QueryError("the click hits no object", got=f"from {origin.tolist()} towards {direction.tolist()}")
         return rows[0]

@@ -1,6 +1,6 @@
 """A map's objects as arrays, made once a map and kept as long as the map is."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from weakref import WeakKeyDictionary
 
@@ -27,8 +27,8 @@ class Index:
         self.nodes: tuple[SceneObject, ...] = tuple(node for node in scene.objects.nodes if node.level != SCENE)
         self.ids: Int64[np.ndarray, " n"] = np.array([node.id for node in self.nodes], dtype=np.int64)
         self.boxes = Boxes.of(self.nodes)
-        self.levels = np.array([node.level for node in self.nodes], dtype="U8")
-        self.states = np.array([node.state for node in self.nodes], dtype="U8")
+        self.level_names, self.levels = _coded([node.level for node in self.nodes])
+        self.state_names, self.states = _coded([node.state for node in self.nodes])
         self._voxels = scene.voxels
         self._voxel_size = scene.voxels.voxel_size
         self._dim = scene.voxels.dim
@@ -77,6 +77,14 @@ class Index:
                 degree[i] = colors.degrees(self.voxel_color_names[seen])[colors.NAMES.index(name)]
         return degree, known
 
+    def on_levels(self, names: Iterable[str]) -> Bool[np.ndarray, " n"]:
+        """Tell which nodes are of some levels."""
+        return np.array([name in set(names) for name in self.level_names] or [False])[self.levels]
+
+    def in_states(self, names: Iterable[str]) -> Bool[np.ndarray, " n"]:
+        """Tell which nodes are in some states of motion."""
+        return np.array([name in set(names) for name in self.state_names] or [False])[self.states]
+
     def anchor(self, row: int) -> Anchor:
         """Return a node as something to compare with: its box, or its voxels where the box says too little."""
         if row not in self._anchors:
@@ -88,6 +96,13 @@ class Index:
                 columns = None
             self._anchors[row] = Anchor(box, columns)
         return self._anchors[row]
+
+
+def _coded(values: list[str]) -> tuple[list[str], Int64[np.ndarray, " n"]]:
+    """Return the different texts, and the number of each value among them: numbers compare faster."""
+    names = sorted(set(values))
+    number = {name: i for i, name in enumerate(names)}
+    return names, np.array([number[value] for value in values], dtype=np.int64)
 
 
 _KEPT: "WeakKeyDictionary[SceneMap, Index]" = WeakKeyDictionary()

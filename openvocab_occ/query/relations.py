@@ -13,7 +13,7 @@ To the viewer itself they are by its heading. Peers' borders are kept where they
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int64
 
 from openvocab_occ.query.boxes import Boxes, cover, gap, ground_gap, height_gap, repeated
 
@@ -98,22 +98,30 @@ def distance(things: Boxes, anchor: Anchor) -> Float64[np.ndarray, " n"]:
 
 def within(things: Boxes, anchor: Anchor, low: float, high: float | None) -> Float64[np.ndarray, " n"]:
     """Return 1 where the gap lies in a range, falling to 0 at a tenth beyond its ends: 1/2 at 5 % beyond."""
-    d = distance(things, anchor)
-    degree = np.ones(len(things)) if high is None else falling(d, high, high * 1.1 + 1e-9)
-    return degree if low <= 0 else np.minimum(degree, rising(d, low * 0.9, low))
+    degree = np.zeros(len(things))
+    rows = _in_reach(things, anchor, None if high is None else high * 1.1 + 1e-9)
+    if len(rows):
+        d = distance(things.take(rows), anchor)
+        below = np.ones(len(rows)) if high is None else falling(d, high, high * 1.1 + 1e-9)
+        degree[rows] = below if low <= 0 else np.minimum(below, rising(d, low * 0.9, low))
+    return degree
 
 
 def related(name: str, things: Boxes, anchor: Anchor, viewer: Viewpoint) -> Float64[np.ndarray, " n"]:
     """Return how far each thing stands in a relation (other than `between`) to an anchor."""
     degree = np.zeros(len(things))
-    reach = REACH.get(name)
-    rows = np.arange(len(things))
-    if reach is not None:
-        apart = np.linalg.norm(things.center[:, :2] - anchor.box.center[0, :2], axis=1)
-        rows = np.flatnonzero(apart <= reach + things.radius + anchor.box.radius[0])
+    rows = _in_reach(things, anchor, REACH.get(name))
     if len(rows):
         degree[rows] = _related(name, things.take(rows), anchor, viewer)
     return degree
+
+
+def _in_reach(things: Boxes, anchor: Anchor, reach: float | None) -> Int64[np.ndarray, " m"]:
+    """Return the rows whose gap to the anchor may be at most `reach`, by the circles around both."""
+    if reach is None:
+        return np.arange(len(things))
+    apart = np.linalg.norm(things.center[:, :2] - anchor.box.center[0, :2], axis=1)
+    return np.flatnonzero(apart <= reach + things.radius + anchor.box.radius[0])
 
 
 def between(things: Boxes, a: Anchor, b: Anchor) -> Float64[np.ndarray, " n"]:

@@ -97,6 +97,8 @@ def text_words(text: str) -> list[str]:
 
 def label_forms(labels: Sequence[str], words: Sequence[str]) -> bool:
     """Tell whether words, in any inflection, are one of the labels."""
+    if not labels:
+        return False
     known = _by_form(tuple(labels))
     return any(form in known for form in _forms(words))
 
