@@ -56,6 +56,10 @@ class MapError(DataError):
     """A saved map that is damaged, from the future, or not a map."""
 
 
+class StorageError(OpenVocabOccError, OSError):
+    """A disk or store that does not take what is written: full, read-only, gone, or fought over."""
+
+
 class EncoderMismatchError(MapError):
     """A query by another encoder than the one that made the map."""
 
@@ -74,10 +78,6 @@ class NotFoundError(OpenVocabOccError, FileNotFoundError):
 
 class AlreadyExistsError(OpenVocabOccError, FileExistsError):
     """An output that would overwrite something it should not."""
-
-
-class StorageError(OpenVocabOccError, OSError):
-    """A file that could not be written: the disk is full, or may not be written to."""
 
 
 class MissingExtraError(OpenVocabOccError, ImportError):

@@ -7,7 +7,8 @@ import numpy as np
 from openvocab_occ._jit import kernel
 
 _TOLERANCE = 1e-6
-"""Voxels: a centre this little below a face counts as above it, as in `keys_of`."""
+"""Voxels. A point this little below a face of the map counts as above it, as in `keys_of`; so a centre of the map this
+little above a face of the grid counts as below it, and layers half a voxel off the lattice move up, not both ways."""
 
 
 @kernel
@@ -38,7 +39,7 @@ def held(index, T_grid_map, T_map_grid, start, stop, out_source, out_keys):
                         at = T_grid_map[a, 3]
                         for b in range(3):
                             at += T_grid_map[a, b] * key[b]
-                        if int(np.floor(at + _TOLERANCE)) != index[g, a]:
+                        if int(np.floor(at - _TOLERANCE)) != index[g, a]:
                             inside = False
                             break
                     if inside:

@@ -58,9 +58,12 @@ def _look(v, u, inverse, K, rays, options):
     if options[0] > 0.0:
         weight /= 1.0 + 1.0 / (here * options[0]) ** 2
     reach = int(options[4])
-    left, right, above, below = max(u - reach, 0), min(u + reach, w - 1), max(v - reach, 0), min(v + reach, h - 1)
-    du, bend_u = _slope(inverse[v, left] if left < u else 0.0, here, inverse[v, right] if right > u else 0.0)
-    dv, bend_v = _slope(inverse[above, u] if above < v else 0.0, here, inverse[below, u] if below > v else 0.0)
+    left = inverse[v, u - reach] if u >= reach else 0.0
+    right = inverse[v, u + reach] if u + reach < w else 0.0
+    above = inverse[v - reach, u] if v >= reach else 0.0
+    below = inverse[v + reach, u] if v + reach < h else 0.0
+    du, bend_u = _slope(left, here, right)
+    dv, bend_v = _slope(above, here, below)
     if options[3] > 0.0:
         weight /= 1.0 + (max(bend_u, bend_v) / options[3]) ** 2
     x, y = _direction(v, u, K, rays)

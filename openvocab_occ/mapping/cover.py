@@ -61,17 +61,36 @@ def cover_grid(flat: Int64[np.ndarray, " m"], grid: OccupancyGrid, voxel_size: f
     T_grid_world = invert(grid.T_world_grid)
     T_grid_map[:, :3] = T_grid_world[:3, :3] * voxel_size / spec.size[:, None]
     T_grid_map[:, 3] = (T_grid_world[:3, 3] - np.asarray(spec.origin)) / spec.size
-    room = len(flat) * (1 + int(np.prod(spec.size / voxel_size))) + 64
+    return _covered(index, T_grid_map, T_map_grid, int(np.prod(spec.size / voxel_size)))
+
+
+def cover_moved(keys: Int32[np.ndarray, "m 3"], voxel_size: float, T_new_old: Float[np.ndarray, "4 4"]) -> Cover:
+    """Return the voxels that those of a map belong to after a motion of the world, by the rule of `cover_grid`."""
+    there, back = T_new_old[:3].copy(), invert(T_new_old)[:3]
+    there[:, 3] /= voxel_size
+    back[:, 3] /= voxel_size
+    return _covered(keys.astype(np.int64), back, there, 1)
+
+
+def _covered(
+    index: Int64[np.ndarray, "m 3"],
+    T_grid_map: Float[np.ndarray, "3 4"],
+    T_map_grid: Float[np.ndarray, "3 4"],
+    each: int,
+) -> Cover:
+    """Return the cover of voxels of a grid; both poses are in voxels. `each` voxel of it holds about so many keys."""
+    room = len(index) * (1 + each) + 64
     while True:
         row, keys = np.empty(room, dtype=np.int32), np.empty((room, 3), dtype=np.int32)
         count = held(index, T_grid_map, T_map_grid, 0, len(index), row, keys)
         if count >= 0:
             break
         room *= 2
-    own = np.bincount(row[:count], minlength=len(flat))
+    own = np.bincount(row[:count], minlength=len(index))
     empty = np.flatnonzero(own == 0)
+    middles = (index[empty] + 0.5) @ T_map_grid[:, :3].T + T_map_grid[:, 3]
     row = np.concatenate([row[:count], empty.astype(np.int32)])
-    keys = np.concatenate([keys[:count], keys_of(grid.centers(flat[empty]), voxel_size)])
+    keys = np.concatenate([keys[:count], keys_of(middles, 1.0)])
     return Cover(row, keys, (1 / np.maximum(own, 1))[row].astype(np.float32))
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int32, UInt8
 from openvocab_occ._jit import in_slices
 from openvocab_occ.arrays import check_shape
 from openvocab_occ.errors import ConfigError, DataError
-from openvocab_occ.geometry import Camera, invert
+from openvocab_occ.geometry import Camera, invert, transform
 from openvocab_occ.mapping._free_kernels import keep_free, see_through
 from openvocab_occ.mapping.key_table import KeyTable
 from openvocab_occ.mapping.keys import keys_of, pack, packable, unpack
@@ -103,6 +103,18 @@ class FreeSpace:
         twin = FreeSpace(self.voxel_size)
         twin.merge(self)
         return twin
+
+    def moved(self, T_new_old: Float[np.ndarray, "4 4"]) -> "FreeSpace":
+        """Return the record after a rigid motion of the world: each cell goes to the one its centre comes to lie in."""
+        keys, counts = self.blocks
+        block, inner = np.nonzero(counts)
+        cells = keys[block] * EDGE + np.stack(np.unravel_index(inner, (EDGE, EDGE, EDGE)), axis=1)
+        to = keys_of(transform(T_new_old, (cells + 0.5) * self.cell), self.cell)
+        packed, where = np.unique(pack((to // EDGE).astype(np.int32)), return_inverse=True)
+        at = to % EDGE
+        there = np.zeros((len(packed), EDGE**3), dtype=np.uint8)
+        np.maximum.at(there, (where, (at[:, 0] * EDGE + at[:, 1]) * EDGE + at[:, 2]), counts[block, inner])
+        return FreeSpace.from_blocks(self.voxel_size, unpack(packed), there)
 
     @classmethod
     def from_blocks(

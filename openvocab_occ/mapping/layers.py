@@ -77,8 +77,8 @@ def things_of(keys: Int32[np.ndarray, "n 3"]) -> Int32[np.ndarray, " n"]:
     return connected_components(graph, directed=False)[1].astype(np.int32)
 
 
-def moving(layers: Sequence[DynamicLayer], movable: VoxelMap, free: FreeSpace) -> list[Bool[np.ndarray, " t"]]:
-    """Tell which things of each layer moved: frames looked through a good part of where they were.
+def moving(layers: Sequence[DynamicLayer], movable: VoxelMap, free: FreeSpace) -> list[np.ndarray]:
+    """Tell which things of each layer moved, bool[things]: frames looked through a good part of where they were.
 
     A voxel was left when at least half as many frames saw through it as saw something of `movable` in it. A thing
     that was seen in one place only, and never looked through, stays: nothing shows that it moved.
@@ -95,7 +95,7 @@ def moving(layers: Sequence[DynamicLayer], movable: VoxelMap, free: FreeSpace) -
     return told
 
 
-def standing(layers: Sequence[DynamicLayer], moved: Sequence[Bool[np.ndarray, " t"]]) -> Int64[np.ndarray, " n"]:
+def standing(layers: Sequence[DynamicLayer], moved: Sequence[np.ndarray]) -> Int64[np.ndarray, " n"]:
     """Return the packed keys, sorted, of voxels that belong to things that did not move."""
     kept = [pack(layer.keys[~m[layer.thing]]) for layer, m in zip(layers, moved, strict=True)]
     return np.unique(np.concatenate(kept)) if kept else np.empty(0, dtype=np.int64)

@@ -17,6 +17,7 @@ from openvocab_occ.arrays import check_shape
 from openvocab_occ.errors import ConfigError, ShapeError
 from openvocab_occ.geometry import Camera
 from openvocab_occ.mapping import _lift_kernels as kernels
+from openvocab_occ.mapping.key_table import KeyTable
 from openvocab_occ.segmentation.encoder import FeatureMap
 
 _NO_IMAGE = np.empty((0, 0, 3), dtype=np.uint8)
@@ -247,9 +248,10 @@ def _lift_segments(
     count = max(len(segments.vectors), 1)
     # one square a pair of row and segment: the row of the kernel is the pair
     pair = np.where(rows >= 0, rows.astype(np.int64) * count + segments.ids, -1)
-    found, inverse = np.unique(pair[rows >= 0], return_inverse=True)
+    table_of_pairs, chosen = KeyTable(), rows >= 0
     numbered = np.full(rows.shape, -1, dtype=np.int32)
-    numbered[rows >= 0] = inverse
+    numbered[chosen] = table_of_pairs.insert(pair[chosen])
+    found = table_of_pairs.keys
     one = FeatureMap(np.ones((1, 1, 1), np.float32), (1 / 16, 1 / 16), (0.0, 0.0))
     table = _entries(numbered, max(len(found), 1), one, image, sight)
     table = _Entries((found // count)[table.row].astype(np.int32), (found % count)[table.row], table.box, table.fields)

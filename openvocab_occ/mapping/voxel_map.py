@@ -4,11 +4,11 @@ from collections.abc import Callable, Mapping
 from typing import Any, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int, Int32, Int64, UInt8, UInt16
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int32, Int64, UInt8, UInt16
 
 from openvocab_occ.arrays import check_finite, check_shape
 from openvocab_occ.errors import ConfigError, DataError, ShapeError
-from openvocab_occ.mapping.cover import Cover, cover_keys
+from openvocab_occ.mapping.cover import Cover, cover_keys, cover_moved
 from openvocab_occ.mapping.free_space import FreeSpace
 from openvocab_occ.mapping.key_table import KeyTable
 from openvocab_occ.mapping.keys import pack, packable, unpack
@@ -57,6 +57,11 @@ class VoxelMap:
 
     def __len__(self) -> int:
         return len(self._packed)
+
+    @property
+    def num_stored(self) -> int:
+        """Voxels, told without sorting them: cheap while the map grows."""
+        return len(self) if self._load else len(self._table)
 
     def __repr__(self) -> str:
         return f"VoxelMap({len(self)} voxels of {self.voxel_size} m, {self.dim} {self.contract} channels)"
@@ -252,6 +257,31 @@ class VoxelMap:
             self.voxel_size, self.keys[chosen], self.features[chosen], columns, contract=self.contract
         )
         voxels.free = self.free.copy()
+        return voxels
+
+    def moved(self, T_new_old: Float[np.ndarray, "4 4"], *, first_frame: int = 0) -> "VoxelMap":
+        """Return the map after a rigid motion of the world, on the lattice of the new one.
+
+        Frames that best views name are counted from `first_frame` on. Free space is moved cell by cell, and where
+        rounding leaves a gap is not known to be free.
+        """
+        cover = cover_moved(self.keys, self.voxel_size, T_new_old)
+        records = records_from(self.columns(), len(self))[cover.row]
+        for name in ("weight", "color_weight"):
+            records[name] *= cover.share
+        for name in ("color_sum", "normal_sum"):
+            records[name] *= cover.share[:, None]
+        records["normal_sum"] = records["normal_sum"] @ T_new_old[:3, :3].T
+        records["view_frame"] += np.where(records["view_frame"] >= 0, first_frame, 0).astype(np.int32)
+        voxels = VoxelMap(self.voxel_size, self.dim, contract=self.contract, num_classes=self.num_classes)
+        at = voxels._table.insert(pack(cover.keys))
+        voxels._sums.reserve(len(voxels._table))
+        scale = (self.agreement * self.weight)[cover.row] * cover.share
+        voxels._sums.add(at, cover.row, scale, self.features)
+        counts = self.label_counts[cover.row] if self.num_classes else None
+        _, first = np.unique(at, return_index=True)
+        voxels._records.add(*reduced(at, records), 0, None if counts is None else counts[first])
+        voxels.free = self.free.moved(T_new_old)
         return voxels
 
     def columns(self) -> dict[str, np.ndarray]:

@@ -39,8 +39,10 @@ def object_table(nodes: Sequence[SceneObject]) -> pa.Table:
     return pa.Table.from_pylist([_object_row(node) for node in nodes], _OBJECTS)
 
 
-def objects_of(table: pa.Table, voxels: VoxelMap, rows: Int64[np.ndarray, " n"], count: int) -> list[SceneObject]:
-    """Return the nodes of a table of a map of `count` voxels of which `voxels` are the given, sorted, rows.
+def objects_of(
+    table: pa.Table, voxels: VoxelMap, rows: Int64[np.ndarray, " n"] | None, count: int
+) -> list[SceneObject]:
+    """Return the nodes of a table of a map of `count` voxels of which `voxels` are all, or the given, sorted, rows.
 
     Objects all of whose voxels are elsewhere are left out. Box and embedding remain those of the whole object.
     """
@@ -53,7 +55,7 @@ def objects_of(table: pa.Table, voxels: VoxelMap, rows: Int64[np.ndarray, " n"],
         raise MapError(
             f"object {table['id'][int(owner[bad[0]])]} holds voxels that are not there", expected=f"0..{count - 1}"
         )
-    if len(rows) < count:
+    if rows is not None:
         at = np.minimum(np.searchsorted(rows, positions), max(len(rows) - 1, 0))
         there = rows[at] == positions if len(rows) else np.zeros(len(at), dtype=bool)
         positions, owner = at[there], owner[there]

@@ -211,7 +211,7 @@ def _table(folder: Path, name: str, columns: list[str] | None = None, groups: li
 def _write(table: pa.Table, path: Path) -> None:
     """Write a table; weights differ in every bit and are split by byte, what repeats is put in a dictionary."""
     split = [name for name in table.column_names if name in ("weight", "color_weight", "view_score", "agreement")]
-    others = [name for name in table.column_names if name not in split]
+    others: Any = [name for name in table.column_names if name not in split]
     pq.write_table(
         table, path, compression="zstd", compression_level=6, row_group_size=_ROW_GROUP, write_page_checksum=True,
         use_dictionary=others, column_encoding=dict.fromkeys(split, "BYTE_STREAM_SPLIT"),
@@ -244,8 +244,8 @@ def _space_table(space: FreeSpace) -> pa.Table:
 
 def _voxels(
     folder: Path, manifest: Mapping[str, Any], encoder: EncoderInfo, region: Float[np.ndarray, "2 3"] | None
-) -> tuple[VoxelMap, Int64[np.ndarray, " n"]]:
-    """Return the voxels, whose columns are read when asked for, and which rows of the file they are."""
+) -> tuple[VoxelMap, Int64[np.ndarray, " n"] | None]:
+    """Return the voxels, whose columns are read when asked for, and which rows of the file they are; None for all."""
     size, name = float(manifest["voxel_size"]), "voxels.parquet"
     groups = None if region is None else _groups(folder / name, region, size)
     table = _table(folder, name, list(_AXES), groups)
@@ -254,15 +254,14 @@ def _voxels(
     ends = np.array([[a.min(initial=0), a.max(initial=0)] for a in axes], dtype=np.int32).T
     if not packable(ends).all() or (packed[1:] <= packed[:-1]).any():
         raise MapError("voxel keys repeat, are too large or out of order", got=folder, fix="rebuild the map")
-    inside = None
-    rows = np.arange(len(packed))
+    inside = rows = None
     if region is not None and groups is not None:
         centers = (np.stack(axes, axis=1) + 0.5) * size
         inside = ((centers >= region[0]) & (centers < region[1])).all(axis=1)
         with pq.ParquetFile(folder / name) as file:
             lengths = [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)]
         first = np.cumsum([0, *lengths])
-        rows = np.concatenate([np.arange(first[g], first[g + 1]) for g in groups] or [rows])[inside]
+        rows = np.concatenate([np.arange(first[g], first[g + 1]) for g in groups] or [first[:0]])[inside]
         packed = packed[inside]
     read = _reader(folder, encoder.dim, groups, inside)
     classes = int(manifest["num_classes"])

@@ -13,11 +13,12 @@ from openvocab_occ.objects.scene_map import SceneMap
 from openvocab_occ.query.answer import ScoreKind
 from openvocab_occ.query.words import STOP_WORDS, Match, match_labels, singular, text_words
 from openvocab_occ.segmentation.encoder import PixelEncoder
+from openvocab_occ.segmentation.scoring import DEFAULT_THRESHOLD
 
 LOGITS_THRESHOLD = 0.5
 """More likely than not, if the model's probabilities could be trusted."""
-DENSE_THRESHOLD = 0.25
-"""Cosine; what matching pairs of CLIP-like models reach. A card's own scoring goes before it."""
+DENSE_THRESHOLD = DEFAULT_THRESHOLD["cosine"]
+"""For a `dense` encoder whose card says nothing of scores."""
 LIKE_THRESHOLD = 0.8
 """Cosine of two things that look alike: image features lie closer to each other than to words."""
 _MAX_PIXELS = 1 << 25
@@ -40,10 +41,10 @@ class Reading:
 
         One product of matrix and vector; with negatives one product of matrices, so that features are read once.
         """
-        if self.negatives is not None:
+        if self.negatives is not None and self.kind not in ("cosine", "class probability"):
             both = features @ np.concatenate([self.vector[None], self.negatives]).T
             cosine, rival = both[:, 0], both[:, 1:].max(axis=1)
-            return _sigmoid(self.scale * (cosine - rival) + self.bias)  # a softmax of two
+            return _sigmoid(self.scale * (cosine - rival))  # a softmax of two
         cosine = features @ self.vector
         return cosine if self.kind in ("cosine", "class probability") else _sigmoid(self.scale * cosine + self.bias)
 

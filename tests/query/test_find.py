@@ -22,6 +22,7 @@ from openvocab_occ.query.find import find
 from openvocab_occ.query.relations import Viewpoint
 from openvocab_occ.query.scoring import DENSE_THRESHOLD
 from openvocab_occ.query.words import match_labels
+from openvocab_occ.segmentation.scoring import Scoring
 
 LABELS = ("road", "curb", "truck", "traffic cone", "bus", "person")
 
@@ -167,6 +168,28 @@ def test_dense_maps_rank_by_cosine():
     assert answer.score_kind == "cosine"
     assert find(scene, "tree", Encoder(Text())).threshold == DENSE_THRESHOLD
     np.testing.assert_allclose(score_voxels(scene, "tree", Encoder(Text())), scene.voxels.features[:, 1])
+
+
+def test_dense_maps_score_as_their_card_says():
+    scene = scene_of([[1.0, 0.0], [0.6, 0.8], [0.0, 1.0]], contract="dense")
+    encoder = Encoder(Text())
+    encoder.scoring = Scoring(kind="sigmoid", threshold=0.6, scale=10.0, bias=-6.0)
+    answer = find(scene, "tree", encoder)
+    assert (answer.score_kind, answer.threshold, answer.verdict) == ("sigmoid", 0.6, "found")
+    np.testing.assert_allclose([hit.score for hit in answer.hits], 1 / (1 + np.exp([-4.0, -2.0])), rtol=1e-5)
+    assert "sigmoid, not calibrated" in answer.explain()
+    np.testing.assert_allclose(score_voxels(scene, "tree", encoder)[scene.voxels.features[:, 1] == 1], 0.982, atol=1e-3)
+
+
+def test_words_that_the_text_model_does_not_know_are_told():
+    scene = scene_of([[1.0, 0.0], [0.0, 1.0]], contract="dense")
+    encoder = Encoder(Text())
+    encoder.text.unknown_words = lambda text: tuple(w for w in text.split() if w == "xyzzy")
+    answer = find(scene, "the xyzzy", encoder)
+    assert (answer.verdict, answer.unknown, answer.hits, answer.best) == ("unknown words", ("xyzzy",), (), None)
+    assert not score_voxels(scene, "xyzzy", encoder).any()
+    partly = find(scene, "xyzzy tree", encoder)
+    assert (partly.verdict, partly.unknown) == ("found", ("xyzzy",))
 
 
 def test_an_encoder_that_is_missing_mute_other_or_broken_is_told(street):
