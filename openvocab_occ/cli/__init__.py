@@ -23,6 +23,8 @@ COMMANDS = {
     "find": Command("find:find", "ask a map for things in words"),
     "view": Command("view:view", "show a map in the web browser"),
     "export": Command("export:export", "render a semantic view of a map for a person or a model"),
+    "eval grounding": Command("grounding:grounding", "judge answers about the demo city against its truth"),
+    "bench query": Command("grounding:bench_query", "time queries against plain matrix products"),
     "model probe": Command("model:probe", "look at an ONNX model without a card, and draft one"),
     "model check": Command("model:check", "run the self-test of a model's card"),
     "model bench": Command("model:bench", "time a model"),
