@@ -44,9 +44,7 @@ def city(
         print_json(report)
         return
     say = console().print
-    say(f"[bold]{out}[/bold]  {len(report['scenes'])} scenes, {report['keyframes']} keyframes ({report['written']} new), "
-        f"{report['boxes']:,} boxes, {report['seconds']:.1f} s  (synthetic data)")  # fmt: skip
-    say(
-        f"open-vocabulary mapping:  openvocab-occ map nuscenes {out} --scene {report['scenes'][0]} --encoder ONNX --out MAP"
-    )
+    count = f"{len(report['scenes'])} scenes, {report['keyframes']} keyframes ({report['written']} new)"
+    say(f"[bold]{out}[/bold]  {count}, {report['boxes']:,} boxes, {report['seconds']:.1f} s  (synthetic data)")
+    say(f"map a scene of it:  openvocab-occ map nuscenes {out} --scene {report['scenes'][0]} --encoder ONNX --out MAP")
     say(f"pictures for people:  {out}/sheets")

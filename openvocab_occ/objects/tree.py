@@ -1,7 +1,7 @@
 """Objects, and the tree they stand in: the scene at its root, objects below it."""
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence, Set
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -100,3 +100,24 @@ class ObjectTree:
 
     def __repr__(self) -> str:
         return f"ObjectTree({len(self)} objects)"
+
+
+def without(nodes: Sequence[SceneObject], gone: Set[int]) -> list[SceneObject]:
+    """Return the nodes without those whose id is `gone`, unless something below them stays.
+
+    Nodes that lose all that was below them go too, but for the root.
+    """
+    by_id = {node.id: node for node in nodes}
+    kept: set[int] = {0}
+    for node in nodes:
+        if node.id in gone or (node.children and not len(node.voxels)):
+            continue
+        up: int | None = node.id
+        while up is not None and up not in kept:
+            kept.add(up)
+            up = by_id[up].parent if up in by_id else None
+    return [
+        replace(node, children=tuple(child for child in node.children if child in kept))
+        for node in nodes
+        if node.id in kept
+    ]

@@ -16,7 +16,7 @@ from openvocab_occ.segmentation.demo_models import street_model
 def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A saved map of the synthetic street."""
     path = tmp_path_factory.mktemp("maps") / "street.ovmap"
-    assert main(["map", "city", "any", "--encoder", str(street_model()), "--out", str(path), "--frames", "3"]) == 0
+    assert main(["map", "street", "any", "--encoder", str(street_model()), "--out", str(path), "--frames", "3"]) == 0
     return path
 
 
@@ -64,8 +64,8 @@ def test_map_find_export_print_json(street, tmp_path, capsys):
     report = printed(capsys)
     assert "view.json" in report["files"]
     assert report["answer"]["hits"] == answer["hits"]
-    assert main(["map", "city", "any", "--encoder", str(street_model()), "--out", str(tmp_path / "a.ovmap"), "--frames",
-                 "1", "--json"]) == 0  # fmt: skip
+    out = ["--out", str(tmp_path / "a.ovmap"), "--frames", "1", "--json"]
+    assert main(["map", "street", "any", "--encoder", str(street_model()), *out]) == 0
     report = printed(capsys)
     assert report["frames"] == 1
     assert report["synthetic"] is True
@@ -100,7 +100,7 @@ class TestBadInput:
 
     def test_missing_model(self, tmp_path, capsys):
         message = refused(
-            capsys, "map", "city", "any", "--encoder", tmp_path / "no.onnx", "--out", tmp_path / "a.ovmap"
+            capsys, "map", "street", "any", "--encoder", tmp_path / "no.onnx", "--out", tmp_path / "a.ovmap"
         )
         assert "no.onnx" in message
         assert not list(tmp_path.iterdir())
@@ -115,14 +115,16 @@ class TestBadInput:
     def test_output_that_is_not_ours(self, tmp_path, capsys):
         (tmp_path / "a.ovmap").mkdir()
         (tmp_path / "a.ovmap" / "holiday.jpg").write_bytes(b"x")
-        message = refused(capsys, "map", "city", "any", "--encoder", street_model(), "--frames", "1", "--out",
+        message = refused(capsys, "map", "street", "any", "--encoder", street_model(), "--frames", "1", "--out",
                           tmp_path / "a.ovmap")  # fmt: skip
         assert "not ours" in message
         assert (tmp_path / "a.ovmap" / "holiday.jpg").read_bytes() == b"x"
 
     def test_output_that_cannot_be_written_is_said_before_the_work(self, tmp_path, capsys):
         (tmp_path / "file").touch()
-        message = refused(capsys, "map", "city", "any", "--encoder", "no.onnx", "--out", tmp_path / "file" / "a.ovmap")
+        message = refused(
+            capsys, "map", "street", "any", "--encoder", "no.onnx", "--out", tmp_path / "file" / "a.ovmap"
+        )
         assert "cannot be written" in message
 
     @pytest.mark.data
@@ -131,7 +133,7 @@ class TestBadInput:
         card = tmp_path / "wrong.card.yaml"
         shipped = next(SHIPPED.glob("deeplab*.card.yaml")).read_text()
         card.write_text(shipped.replace("bus, car, cat", "bus, cat").replace("- car\n", ""))
-        message = refused(capsys, "map", "city", "any", "--encoder", model, "--card", card, "--out", tmp_path / "a")
+        message = refused(capsys, "map", "street", "any", "--encoder", model, "--card", card, "--out", tmp_path / "a")
         assert "20" in message
         assert "21" in message
 

@@ -10,8 +10,11 @@
 
 A `Rendering` holds `.image` (RGB), `.depth` (true z-depth, 0 for the sky), `.semantic` (Occ3D class, `LABELS`; 255 for
 the sky), `.instance` (number of the thing, 0 for the sky) and `.part` (`PART_NAMES`; 255 for the sky). What a number
-stands for is in `drive.attributes()`: class, kind ("box truck"), colour name and parts of each instance. Cameras may stand
-anywhere. Everything is drawn from seeds: the same call gives the same picture on the same machine.
+stands for is in `drive.attributes()`: class, kind ("box truck"), colour name and parts of each instance. Cameras may
+stand anywhere. Everything is drawn from seeds: the same call gives the same picture on the same machine.
+
+`keyframes` makes LiDAR sweeps, boxes and Occ3D labels, `oracle.perceive` stands in for a perception network, and
+`writer.write_city` writes it all as a nuScenes tree. `load_sequence("city", ...)` gives plain frames.
 """
 
 from openvocab_occ.datasets.city.city import Attributes as Attributes

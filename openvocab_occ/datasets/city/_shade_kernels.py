@@ -169,9 +169,9 @@ def _glow(material, u, v, fp, instance, night, a):
         return 0.1 + 1.5 * night
     if material != WINDOW:
         return 0.0
-    h = _hash(int(math.floor(u / 2.6)), int(math.floor((v - 0.4) / 3.0)), instance)
+    h = _hash(math.floor(u / 2.6), math.floor((v - 0.4) / 3.0), instance)
     blur = _fade(fp, 3)
-    inside = 1 + (0.9 * _hash(int(math.floor(u / 0.42)), int(math.floor(v / 0.5)), 43) - 0.45) * blur
+    inside = 1 + (0.9 * _hash(math.floor(u / 0.42), math.floor(v / 0.5), 43) - 0.45) * blur
     for c in range(3):
         a[c] *= inside
     if night > 0 and h < 0.45:
@@ -187,7 +187,7 @@ def _glow(material, u, v, fp, instance, night, a):
 @kernel
 @no_type_check
 def _lamps(x, y, z, nx, ny, nz, soft, lamps, out):
-    """Add up the light of lamps and headlights. Rows: position, direction, colour, cosine of the cone, reach squared."""
+    """Add up the light of lamps. Rows: position, direction, colour, cosine of the cone, reach squared."""
     out[0] = out[1] = out[2] = 0.0
     for i in range(lamps.shape[0]):
         lx, ly, lz = lamps[i, 0] - x, lamps[i, 1] - y, lamps[i, 2] - z
@@ -221,8 +221,8 @@ def _occlusion(x, y, ground, origin, cell):
 
 @kernel
 @no_type_check
-def shade(rays, t, face, corners, normals, lit, uv, color, material, instance, ground, origin, cell, anchor, light, lamps,
-          focal, start, stop, out):  # fmt: skip
+def shade(rays, t, face, corners, normals, lit, uv, color, material, instance, ground, origin, cell, anchor, light,
+          lamps, focal, start, stop, out):  # fmt: skip
     """Put the linear colour of rays start..stop into out.
 
     rays: origin and direction; t: length along it, infinite for the sky; face, corners: triangle and barycentric
@@ -291,10 +291,7 @@ def shade(rays, t, face, corners, normals, lit, uv, color, material, instance, g
         _lamps(x, y, z, nx, ny, nz, m == LEAF, lamps, glare)
         up = 0.5 + 0.5 * nz
         clear = math.exp(-light[HAZE] * distance)
-        if nz <= 0.7:
-            mirror_dim = 1.0
-        else:
-            mirror_dim = ambient
+        mirror_dim = 1.0 if nz <= 0.7 else ambient
         for c in range(3):
             around = (light[ZENITH + c] * 0.55 + light[HORIZON + c] * 0.45) * up + light[BOUNCE + c] * (1 - up)
             col = a[c] * (light[SUN_COLOR + c] * sun + around * ambient * light[AMBIENT] + glare[c])

@@ -57,8 +57,8 @@ def _sheet(a, u, w, n, axis, x0, x1, per_voxel, doubled, label, owner, weight, a
         d = p if k == 0 else q
         low, high = a[d] + min(0.0, u[d], w[d]), a[d] + max(0.0, u[d], w[d])
         first, last = (x0, x1) if d == 0 else (0, area.shape[d])
-        lows[k] = max(first, int(math.floor(low))) * per_voxel
-        highs[k] = min(last, int(math.floor(high)) + 1) * per_voxel
+        lows[k] = max(first, math.floor(low)) * per_voxel
+        highs[k] = min(last, math.floor(high) + 1) * per_voxel
     cell = np.empty(3, np.int64)
     for i in range(lows[0], highs[0]):
         for j in range(lows[1], highs[1]):
@@ -66,7 +66,7 @@ def _sheet(a, u, w, n, axis, x0, x1, per_voxel, doubled, label, owner, weight, a
             l1, l2 = (dp * w[q] - dq * w[p]) / n[axis], (u[p] * dq - u[q] * dp) / n[axis]
             if l1 >= 0 and l2 >= 0 and l1 + l2 <= 1:
                 cell[p], cell[q] = i // per_voxel, j // per_voxel
-                cell[axis] = int(math.floor(a[axis] + l1 * u[axis] + l2 * w[axis]))
+                cell[axis] = math.floor(a[axis] + l1 * u[axis] + l2 * w[axis])
                 _give(cell[0], cell[1], cell[2], x0, x1, label, owner, share, weight, area, best, instance)
 
 
@@ -81,14 +81,14 @@ def _patch(a, u, w, size, per_voxel, x0, x1, label, owner, weight, area, best, i
             edge = u[d] if k == 0 else (w[d] if k == 1 else u[d] - w[d])
             length += edge * edge
         longest = max(longest, length)
-    n = max(1, int(math.ceil(math.sqrt(longest) * per_voxel)))
+    n = max(1, math.ceil(math.sqrt(longest) * per_voxel))
     share = size / (n * n)
     for i in range(n):
         for j in range(2 * (n - i) - 1):
             off = 1 / 3 if j % 2 == 0 else 2 / 3
             l1, l2 = (i + off) / n, (j // 2 + off) / n
-            x, y = int(math.floor(a[0] + l1 * u[0] + l2 * w[0])), int(math.floor(a[1] + l1 * u[1] + l2 * w[1]))
-            z = int(math.floor(a[2] + l1 * u[2] + l2 * w[2]))
+            x, y = math.floor(a[0] + l1 * u[0] + l2 * w[0]), math.floor(a[1] + l1 * u[1] + l2 * w[1])
+            z = math.floor(a[2] + l1 * u[2] + l2 * w[2])
             _give(x, y, z, x0, x1, label, owner, share, weight, area, best, instance)
 
 
@@ -98,12 +98,12 @@ def _cross(a, u, w, nz, x0, x1, label, crossings):
     """Count where the upright lines through the middles of voxel columns pass through a triangle, with sign."""
     X0, X1 = a[0] + min(0.0, u[0], w[0]), a[0] + max(0.0, u[0], w[0])
     Y0, Y1 = a[1] + min(0.0, u[1], w[1]), a[1] + max(0.0, u[1], w[1])
-    for i in range(max(x0, int(math.ceil(X0 - 0.51))), min(x1 - 1, int(math.floor(X1 - 0.49))) + 1):
-        for j in range(max(0, int(math.ceil(Y0 - 0.51))), min(crossings.shape[1] - 1, int(math.floor(Y1 - 0.49))) + 1):
+    for i in range(max(x0, math.ceil(X0 - 0.51)), min(x1 - 1, math.floor(X1 - 0.49)) + 1):
+        for j in range(max(0, math.ceil(Y0 - 0.51)), min(crossings.shape[1] - 1, math.floor(Y1 - 0.49)) + 1):
             dx, dy = i + 0.5003137 - a[0], j + 0.5001713 - a[1]  # off every edge along the axes
             l1, l2 = (dx * w[1] - dy * w[0]) / nz, (u[0] * dy - u[1] * dx) / nz
             if l1 >= 0 and l2 >= 0 and l1 + l2 <= 1:
-                z = int(math.floor(a[2] + l1 * u[2] + l2 * w[2] + 0.5))  # the first cell whose middle is above
+                z = math.floor(a[2] + l1 * u[2] + l2 * w[2] + 0.5)  # the first cell whose middle is above
                 if z < crossings.shape[2]:
                     crossings[i, j, max(z, 0), label] += 1 if nz < 0 else -1
 
@@ -133,19 +133,17 @@ def splat(v, faces, chosen, labels, owners, closed, fill, weight, per_voxel, x0,
             continue
         label, owner = labels[k], owners[k]
         wide = max(high - low, max(0.0, u[1], w[1]) - min(0.0, u[1], w[1]))
-        x, y, z = int(math.floor(low)), int(math.floor(a[1])), int(math.floor(a[2]))
+        x, y, z = math.floor(low), math.floor(a[1]), math.floor(a[2])
         if wide > _LARGE:
             axis = 0
             for d in range(1, 3):
                 if abs(n[d]) > abs(n[axis]):
                     axis = d
-            _sheet(
-                a, u, w, n, axis, x0, x1, int(math.ceil(per_voxel)), doubled, label, owner, weight, area, best, instance
-            )
+            _sheet(a, u, w, n, axis, x0, x1, math.ceil(per_voxel), doubled, label, owner, weight, area, best, instance)
         elif (
-            x == int(math.floor(high)) and 0 <= y < Y and 0 <= z < Z
-            and y == int(math.floor(a[1] + min(0.0, u[1], w[1]))) and y == int(math.floor(a[1] + max(0.0, u[1], w[1])))
-            and z == int(math.floor(a[2] + min(0.0, u[2], w[2]))) and z == int(math.floor(a[2] + max(0.0, u[2], w[2])))
+            x == math.floor(high) and 0 <= y < Y and 0 <= z < Z
+            and y == math.floor(a[1] + min(0.0, u[1], w[1])) and y == math.floor(a[1] + max(0.0, u[1], w[1]))
+            and z == math.floor(a[2] + min(0.0, u[2], w[2])) and z == math.floor(a[2] + max(0.0, u[2], w[2]))
         ):  # fmt: skip
             _give(x, y, z, x0, x1, label, owner, doubled / 2, weight, area, best, instance)
         else:

@@ -42,7 +42,13 @@ def _disc(b: Builder, corners: int, radius: float, x: float, surface: Surface, t
     j = (i + 1) % corners
     center = np.full(corners, n)
     faces = [np.stack(f, axis=1) for f in ((center, i, j), (center + n + 1, j + n + 1, i + n + 1))]
-    b.add(np.concatenate([front, front + (0.02, 0.0, 0.0)]), np.concatenate(faces), surface, Part.SIGN, solid=False)
+    b.add(
+        np.concatenate([front, front + np.array([0.02, 0.0, 0.0])]),
+        np.concatenate(faces),
+        surface,
+        Part.SIGN,
+        solid=False,
+    )
 
 
 @lru_cache(maxsize=8)

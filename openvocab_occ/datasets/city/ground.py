@@ -108,7 +108,8 @@ def _split(soup: np.ndarray, column: int, level: float) -> tuple[np.ndarray, np.
 def _flat(plan: Plan, soup: np.ndarray, zone: str) -> Mesh:
     """Return a level surface; the texture of paved zones runs along the nearest street."""
     corners = np.concatenate([soup[:, :, :2], np.full((*soup.shape[:2], 1), _HEIGHTS[zone])], axis=2)
-    size = np.cross(soup[:, 1, :2] - soup[:, 0, :2], soup[:, 2, :2] - soup[:, 0, :2])
+    p, q = soup[:, 1, :2] - soup[:, 0, :2], soup[:, 2, :2] - soup[:, 0, :2]
+    size = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
     corners, soup = corners[size > 1e-9], soup[size > 1e-9]
     uv = soup[:, :, :2].astype(np.float32)
     if zone not in ("terrain", "square"):
@@ -231,7 +232,9 @@ def _mark_lot(b: Builder, lot: Patch) -> None:
     for y0, y1 in ((7.4, 12.6), (-2.6, 2.6)):
         for x in np.arange(-15.4, 15.5, 2.8):
             corners = np.array([(x - 0.06, y0), (x + 0.06, y0), (x + 0.06, y1), (x - 0.06, y1)]) @ turn.T + middle
-            b.sheet(np.hstack([corners, np.full((4, 1), _PAINT)]), Surface(Material.MARKING, "#e9e7df"), Part.MARKING)
+            b.sheet(
+                list(np.hstack([corners, np.full((4, 1), _PAINT)])), Surface(Material.MARKING, "#e9e7df"), Part.MARKING
+            )
 
 
 def _mesh(corners: np.ndarray, uv: np.ndarray, surface: Surface, part: Part) -> Mesh:

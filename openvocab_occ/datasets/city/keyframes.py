@@ -93,10 +93,11 @@ def boxes(drive: Traversal, index: int) -> list[Box]:
     """Return the boxes of everything that could move within 60 m of the ego."""
     time = index * PERIOD
     ego = drive.T_world_ego(time)
-    found = []
-    for thing in drive.still:
-        if thing.label in MOVABLE and np.hypot(*(np.array(thing.position[:2]) - ego[:2, 3])) < BOX_RANGE:
-            found.append(_box(thing, thing.pose(), (0.0, 0.0), False))
+    found = [
+        _box(thing, thing.pose(), (0.0, 0.0), False)
+        for thing in drive.still
+        if thing.label in MOVABLE and np.hypot(*(np.array(thing.position[:2]) - ego[:2, 3])) < BOX_RANGE
+    ]
     for mover in drive.movers:
         T = drive.mover_pose(mover, time)
         if np.hypot(*(T[:2, 3] - ego[:2, 3])) < BOX_RANGE:

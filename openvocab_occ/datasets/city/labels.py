@@ -1,9 +1,9 @@
 """Occ3D labels of a keyframe: semantics, instances, and what LiDAR and cameras observe.
 
-`mask_lidar`: voxels that rays of the 32 beams cross before they hit, and those they hit, from where the ego stands at this
-keyframe and at four around it (Occ3D accumulates the sweeps of a scene; moving things are taken as they stand now).
-`mask_camera`: the same of rays through pixels of the six cameras, and within `mask_lidar`. Both walk the voxels, not the
-meshes, so that a mask agrees with the labels beside it.
+`mask_lidar`: voxels that rays of the 32 beams cross before they hit, and those they hit, from where the ego stands at
+this keyframe and at four around it (Occ3D accumulates the sweeps of a scene); moving things are taken as they stand
+now. `mask_camera`: the same of rays through pixels of the six cameras, and within `mask_lidar`. Both walk the voxels,
+not the meshes, so that a mask agrees with the labels beside it.
 """
 
 from dataclasses import dataclass

@@ -105,7 +105,7 @@ def _turn(before: np.ndarray, after: np.ndarray) -> np.ndarray | None:
     d, e = d / np.linalg.norm(d), e / np.linalg.norm(e)
     if d @ e < -0.7:
         return None
-    reach = np.linalg.norm(q - p) * 0.4
+    reach = np.linalg.norm(q - p) * 0.48  # wider than a circle, away from the corner
     t = np.linspace(0, 1, 60)[:, None]
     a, b = p + d * reach, q - e * reach
     curve = (1 - t) ** 3 * p + 3 * (1 - t) ** 2 * t * a + 3 * (1 - t) * t**2 * b + t**3 * q

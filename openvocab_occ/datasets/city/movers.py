@@ -1,6 +1,7 @@
 """Who is on the move during a traversal, and where they go."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -44,6 +45,7 @@ def ego_route(town: Town, route: int) -> list[int]:
     return random_route(town.lanes, start, 420.0, rng)
 
 
+@lru_cache(maxsize=8)
 def set_going(town: Town, route: int, traversal: int, traffic: float) -> tuple[Motion, list[Mover]]:
     """Simulate a traversal; return the ego's motion and everyone else's, time 0 being the first keyframe."""
     rng = np.random.default_rng([town.seed, 42, route, traversal, round(10 * traffic)])
@@ -150,7 +152,7 @@ def _walkers(town: Town, way: list[int], rng: np.random.Generator) -> tuple[list
             lead = float(rng.uniform(1.0, 2.6))
             point, heading = street.at(s, side * (street.half_width + lead))
             walkers.append(
-                Crosser((float(point[0]), float(point[1])), float(heading) - side * np.pi / 2, float(rng.uniform(1.1, 1.5)),
-                        lead, 2 * street.half_width)
+                Crosser((float(point[0]), float(point[1])), float(heading) - side * np.pi / 2,
+                        float(rng.uniform(1.1, 1.5)), lead, 2 * street.half_width)
             )  # fmt: skip
     return walkers, [(int(rng.integers(1 << 16)), COLORS[rng.integers(len(COLORS))]) for _ in walkers]

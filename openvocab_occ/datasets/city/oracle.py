@@ -3,13 +3,13 @@
 The model, so that claims about maps and memory can be tested without a network:
 
 - Each voxel is seen (`mask_camera`) or not, at a distance r from the ego.
-- The chance that it is right is `reach` x (0.97 if seen else 0.45) x exp(-(r / far)^2), with `far` 60 m in clear weather; rain,
-  night and fog multiply reach and far (`NOISE`). Errors are drawn in blobs of about two voxels, because networks err in
-  pieces, not in grains of salt.
-- A wrong occupied voxel becomes free (60 %), or takes a class that is easily taken for its own (`CONFUSED`). A wrong free voxel
-  next to something becomes that something (things grow); others stay free.
-- Logits are `sharpness` for the class that won, less for one it is confused with, plus noise; sharpness falls with distance and
-  by condition, so that confidence says something about being right.
+- The chance that it is right is `reach` x (0.97 if seen else 0.45) x exp(-(r / far)^2), with `far` 60 m in clear
+  weather; rain, night and fog lower reach and far (`NOISE`). Errors are drawn in blobs of about two
+  voxels, because networks err in pieces, not in grains of salt.
+- A wrong occupied voxel becomes free (60 %), or takes a class that is easily taken for its own (`CONFUSED`). A wrong
+  free voxel next to something, on one side drawn for the frame, becomes that something; others stay free.
+- The winner's logit exceeds the others by a margin that falls with distance and by condition, next to noise of 0.5, so
+  that confidence says something about being right.
 """
 
 from collections.abc import Mapping

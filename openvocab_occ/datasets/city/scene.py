@@ -74,10 +74,12 @@ def gather(
         ))  # fmt: skip
         start += len(mesh.vertices)
     if not columns:
-        return Triangles(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint32), np.zeros((0, 3, 2), np.float32),
-                         np.zeros((0, 3), np.float32), *(np.zeros(0, np.uint8) for _ in range(3)),
+        none = np.zeros(0, np.uint8)
+        points, faces = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint32)
+        return Triangles(points, faces, np.zeros((0, 3, 2), np.float32), points, none, none, none,
                          np.zeros(0, np.int32), np.zeros(0, np.bool_))  # fmt: skip
-    return Triangles(np.concatenate(vertices), *(np.concatenate(column) for column in zip(*columns, strict=True)))
+    faces, *rest = (np.concatenate(column) for column in zip(*columns, strict=True))
+    return Triangles(np.concatenate(vertices), faces, *rest)
 
 
 def _detail(mesh: Mesh, pose: np.ndarray, origin: np.ndarray) -> Mesh | None:

@@ -67,8 +67,9 @@ def plan_picture(town: Town, metre: float = 3.0) -> UInt8[np.ndarray, "h w 3"]:
     low, size = np.array([x0, y0]) - 40.0, np.array([x1 - x0, y1 - y0]) + 80.0
     w, h = (int(a * metre) for a in size)
     image = np.zeros((h, w, 3), np.uint8)
-    colors = {"terrain": (150, 175, 120), "road": (105, 105, 110), "sidewalk": (190, 186, 178), "square": (200, 165, 130),
-              "tree": (70, 120, 60), "hedge": (70, 120, 60), "shed": (120, 90, 70)}  # fmt: skip
+    colors = {"terrain": (150, 175, 120), "road": (105, 105, 110), "sidewalk": (190, 186, 178),
+              "square": (200, 165, 130), "tree": (70, 120, 60), "hedge": (70, 120, 60),
+              "shed": (120, 90, 70)}  # fmt: skip
     for thing in town.things:
         if thing.kind in ("house", "shop", *colors):
             corners = thing.mesh.vertices[thing.mesh.faces[thing.mesh.part != 19]][:, :, :2]

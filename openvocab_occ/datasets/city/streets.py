@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from openvocab_occ.arrays import ArrayLike
 
@@ -19,7 +19,7 @@ SIDEWALK_WIDTH = 3.2
 CUT = 15.0
 """Lanes end this far before the middle of a junction, metres."""
 _STEP = 1.0
-_BLEND = 7.0  # metres over which two streets round their corners
+_BLEND = 9.0  # metres over which two streets round their corners
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +39,8 @@ class Street:
         return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.points, axis=0), axis=1))])
 
     @cached_property
-    def _tree(self) -> cKDTree:
-        return cKDTree(self.points)
+    def _tree(self) -> KDTree:
+        return KDTree(self.points)
 
     @property
     def length(self) -> float:
@@ -58,7 +58,8 @@ class Street:
         before, after = self._headings[i], self._headings[i + 1]
         heading = before + (after - before) * np.clip(t, 0, 1)
         left = np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
-        return a + (b - a) * t[..., None] + left * np.asarray(lateral, dtype=np.float64)[..., None], heading
+        points = a + (b - a) * t[..., None] + left * np.asarray(lateral, dtype=np.float64)[..., None]
+        return points, np.asarray(heading)
 
     @cached_property
     def _headings(self) -> np.ndarray:
@@ -170,7 +171,7 @@ def _smooth_min(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
 
 
 def draw_plan(rng: np.random.Generator) -> Plan:
-    """Draw a ring road with round corners, a straight main street across it, and two streets up from the ring and it."""
+    """Draw a ring road with round corners, a straight main street across it, and two streets between them."""
     width, height = rng.uniform(290, 330), rng.uniform(210, 240)
     ring = _ring(width, height, rng)
     main_y = height * rng.uniform(0.46, 0.54)
@@ -178,7 +179,7 @@ def draw_plan(rng: np.random.Generator) -> Plan:
     x1, x2 = width * rng.uniform(0.3, 0.37), width * rng.uniform(0.64, 0.7)
     winding = _between(ring, (x1, -10.0), (x1 + rng.uniform(-8, 8), height + 10.0), rng.uniform(7, 10))
     short = [(x2, float(np.interp(x2, main[:, 0], main[:, 1]))), (x2 + rng.uniform(-5, 5), height + 10.0)]
-    upper = _line(short[0], _crossing(_line(*short, 0.0), ring), 0.0)
+    upper = _line(short[0], _crossing(_line(short[0], short[1], 0.0), ring), 0.0)
     wide, narrow = LANE_WIDTH + BAY_WIDTH, LANE_WIDTH
     streets = [Street("Ring Road", ring, wide, True, closed=True)]
     for name, line, half, host in (
@@ -233,7 +234,7 @@ def _line(a: ArrayLike, b: ArrayLike, bow: float) -> np.ndarray:
 def _crossing(line: np.ndarray, ring: np.ndarray) -> np.ndarray:
     """Return the point of the second half of a line that is nearest to the ring."""
     half = line[len(line) // 2 :]
-    distance, _ = cKDTree(ring).query(half)
+    distance, _ = KDTree(ring).query(half)
     return half[int(np.argmin(distance))]
 
 
@@ -259,7 +260,7 @@ def _junctions(streets: list[Street], lines: list[np.ndarray]) -> list[Junction]
             arms = (Arm(host, s, 1), Arm(host, s, -1), Arm(number, own, 1 if end == 0 else -1))
             found.append(Junction((float(point[0]), float(point[1])), arms))
     a, b = streets[1], streets[2]
-    distance, _ = cKDTree(b.points).query(a.points)
+    distance, _ = KDTree(b.points).query(a.points)
     at = a.points[int(np.argmin(distance))]
     sa, sb = (float(street.project(at[None])[0][0]) for street in (a, b))
     arms = (Arm(1, sa, 1), Arm(1, sa, -1), Arm(2, sb, 1), Arm(2, sb, -1))

@@ -1,5 +1,7 @@
-"""The tables of nuScenes (v1.0) for written traversals. Additions to the format: boxes carry `velocity`, `moves`, `kind`,
-`color`, `id`; scenes carry `condition`, `route`, `traversal`."""
+"""The tables of nuScenes (v1.0) for written traversals.
+
+Added to the format: boxes carry `velocity`, `moves`, `kind`, `color`, `id`; scenes `condition`, `route`, `traversal`.
+"""
 
 import hashlib
 from collections.abc import Iterable, Sequence
@@ -111,8 +113,9 @@ def _scene(tables: dict[str, Rows], drive: Traversal, frames: int) -> None:
     })  # fmt: skip
     for i, own in enumerate(samples):
         tables["sample"].append({
-            "token": own, "timestamp": round((drive.start_time() + i * PERIOD) * 1e6), "prev": samples[i - 1] if i else "",
-            "next": samples[i + 1] if i + 1 < frames else "", "scene_token": token(drive.name, "scene"),
+            "token": own, "timestamp": round((drive.start_time() + i * PERIOD) * 1e6),
+            "prev": samples[i - 1] if i else "", "next": samples[i + 1] if i + 1 < frames else "",
+            "scene_token": token(drive.name, "scene"),
         })  # fmt: skip
 
 

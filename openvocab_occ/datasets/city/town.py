@@ -105,7 +105,7 @@ def build_town(seed: int) -> Town:
 def _houses(p: _Planter, street: Street) -> None:
     """Build houses along both sides, most with a garden in front; one is built and one torn down later."""
     stock = [
-        House(width=w, depth=float(p.rng.uniform(8, 10)), floors=int(p.rng.integers(2, 4) if shop else p.rng.integers(1, 4)),
+        House(width=w, depth=float(p.rng.uniform(8, 10)), floors=int(p.rng.integers(2 if shop else 1, 4)),
               flat=shop or p.rng.random() < 0.2, shop=shop, look=int(p.rng.integers(1 << 20)))
         for shop in (False, False, False, True) for w in (9.0, 10.5, 12.0)
     ]  # fmt: skip

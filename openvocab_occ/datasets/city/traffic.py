@@ -1,11 +1,13 @@
 """Who moves: cars follow lanes and each other, wait at junctions, crossings and stops; people walk and cross.
 
-A simulation in steps of a tenth of a second; the ego takes part in it like any other vehicle. Following is the intelligent
-driver model (Treiber, Hennecke, Helbing 2000).
+A simulation in steps of a tenth of a second; the ego takes part in it like any other vehicle. Following is the
+intelligent driver model (Treiber, Hennecke, Helbing 2000).
 """
 
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 
 import numpy as np
 from jaxtyping import Float
@@ -75,7 +77,7 @@ class Simulation:
 
     def __init__(self, graph: LaneGraph, drivers: list[Driver], walkers: list[Crosser]) -> None:
         self._graph, self._drivers, self._walkers = graph, drivers, walkers
-        self._edges = [np.cumsum([0.0] + [graph.lanes[n].length for n in d.route]) for d in drivers]
+        self._edges = [list(accumulate((graph.lanes[n].length for n in d.route), initial=0.0)) for d in drivers]
         self._holders: dict[int, set[int]] = {}  # turn -> drivers in it or let into it
         self._walked = np.zeros(len(walkers))
 
@@ -95,7 +97,7 @@ class Simulation:
         ]
 
     def _lane(self, number: int, s: float) -> int:
-        return min(int(np.searchsorted(self._edges[number], s, side="right")) - 1, len(self._drivers[number].route) - 1)
+        return min(bisect_right(self._edges[number], s) - 1, len(self._drivers[number].route) - 1)
 
     def _place(self, number: int, s: float) -> tuple[float, float, float]:
         k = self._lane(number, s)

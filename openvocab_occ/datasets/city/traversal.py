@@ -232,7 +232,8 @@ class Traversal:
                 if mover.thing.label in VEHICLES and np.hypot(x - eye[0], y - eye[1]) < _LAMP_SIGHT:
                     rows += headlights(x, y, heading, ahead=float(mover.thing.mesh.bounds[1][0]) + 0.3)
             ego = self.T_world_ego(time)
-            rows += headlights(*ego[:2, 3], float(np.arctan2(ego[1, 0], ego[0, 0])), ahead=2.0, ego=True)
+            heading = float(np.arctan2(ego[1, 0], ego[0, 0]))
+            rows += headlights(float(ego[0, 3]), float(ego[1, 3]), heading, ahead=2.0, ego=True)
         lamps = np.array(rows, dtype=np.float64).reshape(-1, 11)
         lamps[:, :3] -= instant.surroundings.origin
         return lamps

@@ -32,7 +32,7 @@ def _leaves(b: Builder, center: np.ndarray, radii: np.ndarray, color: str, rng: 
     reach = size * rng.uniform(0.6, 1.3, (count, 1))
     corners = np.stack([middle - reach * a, middle + reach * c * 0.7, middle + reach * a, middle - reach * c * 0.7], 1)
     first = np.arange(count)[:, None] * 4
-    faces = np.concatenate([first + [0, 1, 2], first + [0, 2, 3]], axis=1).reshape(-1, 3)
+    faces = (first + np.array([0, 1, 2, 0, 2, 3])).reshape(-1, 3)
     b.fine = True
     b.add(corners.reshape(-1, 3), faces, Surface(Material.LEAF, color), Part.CROWN, solid=False)
     b.fine = False

@@ -1,7 +1,7 @@
 """Conditions: what lights the town, what hangs in the air, and what happens to a finished picture."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -36,10 +36,12 @@ class Condition:
     """Moving vehicles, relative to an ordinary day."""
 
 
-_CLEAR = dict(sun=(3.1, 2.75, 2.25), zenith=(0.17, 0.36, 0.78), horizon=(0.62, 0.74, 0.9), bounce=(0.26, 0.24, 0.19),
-              haze=0.0013, haze_color=(0.6, 0.7, 0.84), exposure=0.66, ambient=1.25)  # fmt: skip
+_CLEAR = Condition(
+    sun=(3.1, 2.75, 2.25), zenith=(0.17, 0.36, 0.78), horizon=(0.62, 0.74, 0.9), bounce=(0.26, 0.24, 0.19), haze=0.0013,
+    haze_color=(0.6, 0.7, 0.84), exposure=0.66, ambient=1.25,
+)  # fmt: skip
 CONDITIONS: Mapping[str, Condition] = MappingProxyType({
-    "clear": Condition(**_CLEAR),
+    "clear": _CLEAR,
     "rain": Condition(zenith=(0.36, 0.39, 0.43), horizon=(0.58, 0.61, 0.64), bounce=(0.14, 0.14, 0.14), haze=0.0075,
                       haze_color=(0.5, 0.53, 0.56), wet=1.0, clouds=0.7, exposure=1.0, noise=2.6),
     "night": Condition(sun=(0.03, 0.04, 0.07), zenith=(0.006, 0.01, 0.028), horizon=(0.03, 0.034, 0.056),
@@ -47,7 +49,7 @@ CONDITIONS: Mapping[str, Condition] = MappingProxyType({
                        clouds=0.45, exposure=2.0, noise=3.5, traffic=0.6),
     "fog": Condition(zenith=(0.74, 0.77, 0.8), horizon=(0.8, 0.82, 0.84), bounce=(0.24, 0.24, 0.24), haze=0.026,
                      haze_color=(0.76, 0.785, 0.81), wet=0.25, clouds=0.0, exposure=0.8, ambient=1.0, noise=1.6),
-    "heavy traffic": Condition(**_CLEAR, traffic=2.6),
+    "heavy traffic": replace(_CLEAR, traffic=2.6),
 })  # fmt: skip
 """Conditions by name."""
 
@@ -67,16 +69,16 @@ def light_vector(condition: Condition, azimuth: float, drift: float) -> Float[np
 
 def street_light(position: Sequence[float]) -> list[float]:
     """Return the row of a street lamp for the shader."""
-    return [*position, 0, 0, -1, 34, 24, 13, 0.1, 20.0**2]
+    return [*position, 0.0, 0.0, -1.0, 34.0, 24.0, 13.0, 0.1, 20.0**2]
 
 
 def headlights(x: float, y: float, heading: float, *, ahead: float, ego: bool = False) -> list[list[float]]:
     """Return rows for the beams of a vehicle."""
-    c, s = np.cos(heading), np.sin(heading)
+    c, s = float(np.cos(heading)), float(np.sin(heading))
     if not ego:
-        return [[x + ahead * c, y + ahead * s, 0.75, c, s, -0.09, 16, 15, 13, 0.86, 28.0**2]]
+        return [[x + ahead * c, y + ahead * s, 0.75, c, s, -0.09, 16.0, 15.0, 13.0, 0.86, 28.0**2]]
     return [
-        [x + ahead * c - side * s, y + ahead * s + side * c, 0.8, c, s, -0.06, 17, 16.5, 15, 0.84, 42.0**2]
+        [x + ahead * c - side * s, y + ahead * s + side * c, 0.8, c, s, -0.06, 17.0, 16.5, 15.0, 0.84, 42.0**2]
         for side in (-0.7, 0.7)
     ]
 
