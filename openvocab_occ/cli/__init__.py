@@ -25,6 +25,8 @@ COMMANDS = {
     "view": Command("view:view", "show a map in the web browser"),
     "export": Command("export:export", "render a semantic view of a map for a person or a model"),
     "eval objects": Command("eval_objects:objects", "judge objects by the truth of the demo city"),
+    "eval grounding": Command("grounding:grounding", "judge answers about the demo city against its truth"),
+    "bench query": Command("grounding:bench_query", "time queries against plain matrix products"),
     "model probe": Command("model:probe", "look at an ONNX model without a card, and draft one"),
     "model check": Command("model:check", "run the self-test of a model's card"),
     "model bench": Command("model:bench", "time a model"),

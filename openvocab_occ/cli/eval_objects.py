@@ -39,10 +39,11 @@ def objects(
     from openvocab_occ.evaluation.object_truth import CityTruth, StreetTruth
     from openvocab_occ.evaluation.objects import TruthEncoder, judge_objects
     from openvocab_occ.evaluation.region_truth import score_regions
-    from openvocab_occ.segmentation.demo_models import demo_model
+    from openvocab_occ.segmentation.demo_models import demo_model, street_model
     from openvocab_occ.segmentation.onnx import load_encoder
 
-    model = TruthEncoder() if features == "truth" else load_encoder(encoder or demo_model())
+    shipped = demo_model if world == "city" else street_model
+    model = TruthEncoder() if features == "truth" else load_encoder(encoder or shipped())
     rows: list[dict[str, Any]] = []
     for seed in seeds:
         if world == "city":

@@ -27,11 +27,28 @@ def quantise(logits, top, start, stop, out):
 
 @kernel
 @no_type_check
+def _block(source, i, j, out):
+    """Write 8 x 8 bytes of source to out, eight at a time: out[j, i / 8] holds source[i:i + 8, j], the first lowest."""
+    for b in range(j, j + 8):
+        word = np.uint64(0)
+        for a in range(8):
+            word |= np.uint64(source[i + a, b]) << np.uint64(8 * a)
+        out[b, i >> 3] = word
+
+
+@kernel
+@no_type_check
 def transposed(source, out):
-    """Write source[i, j] to out[j, i], in blocks that fit the first cache."""
+    """Write bytes source[i, j] to bytes [j, i] of out, which is given as little-endian words; sides are multiples of 8.
+
+    The longer side runs fastest: strides of 4096 bytes fall into one set of the first cache, which holds eight lines.
+    """
     rows, columns = source.shape
-    for i0 in range(0, rows, 64):
-        for j0 in range(0, columns, 64):
-            for i in range(i0, min(i0 + 64, rows)):
-                for j in range(j0, min(j0 + 64, columns)):
-                    out[j, i] = source[i, j]
+    if columns > rows:
+        for i in range(0, rows, 8):
+            for j in range(0, columns, 8):
+                _block(source, i, j, out)
+    else:
+        for j in range(0, columns, 8):
+            for i in range(0, rows, 8):
+                _block(source, i, j, out)

@@ -85,7 +85,7 @@ class Layer:
         def unpack(start: int, stop: int) -> None:
             for n in range(start, stop):
                 with translated(self._at(wanted[n])):
-                    transposed(_flat(futures[n].result()), tiles[n].record)
+                    transposed(_flat(futures[n].result()), tiles[n].record.view("<u8"))
 
         in_slices(unpack, len(wanted))
         return dict(zip(wanted, tiles, strict=True))
@@ -146,7 +146,7 @@ class Layer:
             for n in range(start, stop):
                 tile = Tile(self.schema, np.empty((TILE * TILE, self.schema.planes), np.uint8))
                 with translated(self._at(keys[n])):
-                    transposed(_flat(futures[n].result()), tile.record)
+                    transposed(_flat(futures[n].result()), tile.record.view("<u8"))
                 counts[keys[n]] = change(keys[n], tile)
                 if counts[keys[n]]:
                     with translated(self._at(keys[n])):
@@ -159,7 +159,7 @@ class Layer:
 
     def _packed(self, tile: Tile) -> np.ndarray:
         planes = np.empty((self.schema.planes, TILE * TILE), np.uint8)
-        transposed(tile.record, planes)
+        transposed(tile.record, planes.view("<u8"))
         return planes.reshape(-1, TILE, TILE)
 
     def _at(self, key: TileKey) -> str:

@@ -37,7 +37,9 @@ def test_tree_reads_as_nuscenes(tree):
         index = index[grid.spec.contains(index)]
         near = np.zeros(len(index), bool)
         for step in np.ndindex(3, 3, 3):
-            near |= (grid.labels != grid.free_label)[tuple(np.clip(index + step - 1, 0, np.array(grid.spec.shape) - 1).T)]
+            near |= (grid.labels != grid.free_label)[
+                tuple(np.clip(index + step - 1, 0, np.array(grid.spec.shape) - 1).T)
+            ]
         assert near.mean() > 0.95
 
 

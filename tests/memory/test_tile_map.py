@@ -14,6 +14,7 @@ import openvocab_occ as ovo
 from openvocab_occ.errors import AlreadyExistsError, ConfigError, DataError, NotFoundError, PoseError, ShapeError
 from openvocab_occ.geometry import GridSpec, pose
 from openvocab_occ.memory import TileMap
+from openvocab_occ.memory._codec_kernels import transposed
 from openvocab_occ.memory._tiles_kernels import gather, locate, merge_rows, merge_tiles
 from openvocab_occ.memory._tiles_reference import greatest, rows_of_voxels, window
 from openvocab_occ.memory.layer import TileKey
@@ -342,6 +343,14 @@ def test_locate_agrees_with_its_reference(seed):
         found = locate(frame.to_grid(key), rows, out)
         assert found == (out >= 0).sum()
         assert (out == rows_of_voxels(voxel_centers(city, key), T, spec, rows)).all()
+
+
+@pytest.mark.parametrize("shape", [(8, 8), (480, 4096), (4096, 480), (16, 40)])
+def test_transposed_is_the_transpose(rng, shape):
+    source = rng.integers(0, 256, shape, dtype=np.uint8)
+    out = np.empty(shape[::-1], np.uint8)
+    transposed(source, out.view("<u8"))
+    assert (out == source.T).all()
 
 
 def test_gather_of_nothing():
