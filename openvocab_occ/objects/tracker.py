@@ -122,6 +122,8 @@ class Tracker:
         self, segments: Sequence[Segment], cells: Sequence[list[int]], shared: Sequence[Counter[int]], time: float
     ) -> list[int]:
         from scipy.optimize import linear_sum_assignment
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
 
         ids = [0] * len(segments)
         scores: dict[tuple[int, int], float] = {}
@@ -132,14 +134,23 @@ class Tracker:
                     scores[number, id] = score
         if not scores:
             return ids
-        rows, columns = sorted({n for n, _ in scores}), sorted({i for _, i in scores})
-        row, column = {n: r for r, n in enumerate(rows)}, {i: c for c, i in enumerate(columns)}
-        table = np.zeros((len(rows), len(columns)))
-        for (n, i), score in scores.items():
-            table[row[n], column[i]] = score
-        for r, c in zip(*linear_sum_assignment(table, maximize=True), strict=True):
-            if table[r, c] > 0:
-                ids[rows[r]] = columns[c]
+        # pairs that share no segment and no track are decided apart: most pairs are alone
+        numbers, inverse = np.unique([n for n, _ in scores], return_inverse=True)
+        tracks, column = np.unique([i for _, i in scores], return_inverse=True)
+        total = len(numbers) + len(tracks)
+        graph = coo_array((np.ones(len(scores), bool), (inverse, len(numbers) + column)), shape=(total, total))
+        count, part = connected_components(graph, directed=False)
+        groups: list[list[tuple[int, int]]] = [[] for _ in range(count)]
+        for pair, at in zip(scores, inverse, strict=True):
+            groups[part[at]].append(pair)
+        for pairs in groups:
+            rows, columns = sorted({n for n, _ in pairs}), sorted({i for _, i in pairs})
+            table = np.zeros((len(rows), len(columns)))
+            for n, i in pairs:
+                table[rows.index(n), columns.index(i)] = scores[n, i]
+            for r, c in zip(*linear_sum_assignment(table, maximize=True), strict=True):
+                if table[r, c] > 0:
+                    ids[rows[r]] = columns[c]
         return ids
 
     def _near(self, segment: Segment, time: float) -> list[int]:
