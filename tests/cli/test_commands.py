@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from openvocab_occ.cli import COMMANDS, main
-from openvocab_occ.segmentation.card import SHIPPED
+from openvocab_occ.segmentation.card_files import SHIPPED
 from openvocab_occ.segmentation.demo_models import street_model
 
 
