@@ -38,7 +38,7 @@ class SceneObject:
     box: Box
     voxels: Int64[np.ndarray, " n"] = field(repr=False)
     """Positions in the VoxelMap of the same SceneMap; none for the scene, which holds all."""
-    points: Float32[np.ndarray, "n 3"] = field(repr=False)
+    points: Float32[np.ndarray, "p 3"] = field(repr=False)
     """Centres of the voxels in the world, metres. Rounded by up to 0.03 mm at 1 km."""
     embedding: Float32[np.ndarray, " c"] = field(repr=False)
     """Mean feature of the voxels; a unit vector for a `dense` map, a distribution for a `logits` map."""
