@@ -61,6 +61,7 @@ def test_a_full_disk_is_told_and_what_was_there_stays(city, rng):
 import resource, sys
 import numpy as np
 from openvocab_occ.errors import StorageError
+from openvocab_occ.geometry import GridSpec
 from openvocab_occ.memory import TileMap
 city, spec = TileMap.open(sys.argv[1]), GridSpec((-4.0, -4.8, -1.0), 0.4, (20, 24, 8))
 logits = np.random.default_rng(1).normal(0, 2, (20, 24, 8, 4)).astype(np.float32)
