@@ -13,6 +13,6 @@ class ShipDemoModels(BuildHookInterface):  # noqa: D101 - hatchling finds it by 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:  # noqa: D102
         if version == "standard":
             for folder in ("demo", "street"):
-                for file in sorted(Path("models", folder).iterdir()):
+                for file in sorted(Path(self.root, "models", folder).iterdir()):
                     if file.suffix in SHIPPED or file.name == "NOTICE":
                         build_data["force_include"][str(file)] = f"openvocab_occ/segmentation/{folder}/{file.name}"

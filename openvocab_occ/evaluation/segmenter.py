@@ -97,7 +97,8 @@ def evaluate(
     names = list(CLASSES)
     prompts = encoder.text.encode(names)
     pairs = encoder.text.encode([f"{color} {name}" for color, name in NEVER_RENDERED])
-    absent = encoder.text.encode(UNSEEN_ABSENT)
+    absent_words = [word for word in UNSEEN_ABSENT if not _unknown(encoder, word)]
+    absent = encoder.text.encode(absent_words)
     plain = Scoring(kind="cosine", threshold=DEFAULT_THRESHOLD["cosine"])
     scoring: Scoring = getattr(encoder, "scoring", None) or plain
     confusion = np.zeros((len(names), len(names)), dtype=np.int64)
@@ -144,7 +145,8 @@ def evaluate(
         "unseen_synonyms_wrong": wrong,
         "absent_fired_median": float(np.median(fired / asked)),
         "absent_fired_worst": float((fired / asked).max()),
-        "absent_fired": dict(zip(UNSEEN_ABSENT, (fired / asked).tolist(), strict=True)),
+        "absent_fired": dict(zip(absent_words, (fired / asked).tolist(), strict=True)),
+        "absent_not_known": [word for word in UNSEEN_ABSENT if word not in absent_words],
         "ms_per_image": 1e3 * float(np.median(seconds)),
     }
     if lexicon:

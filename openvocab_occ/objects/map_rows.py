@@ -20,7 +20,12 @@ _OBJECTS = pa.schema([
     ("center", VECTOR), ("size", VECTOR), ("yaw", pa.float64()),
     ("embedding", pa.list_(pa.float32())), ("voxels", pa.list_(pa.int64())),
     ("views", pa.list_(pa.struct([("frame", pa.int32()), ("view", pa.string()), ("box", pa.list_(pa.int32()))]))),
+    ("evidence", pa.string()), ("confidence", pa.float64()), ("heading", pa.float64()), ("speed", pa.float64()),
+    ("times_seen", pa.int64()), ("first_seen", pa.float64()), ("last_seen", pa.float64()), ("agreement", pa.float64()),
+    ("names", pa.list_(pa.struct([("name", pa.string()), ("score", pa.float64())]))),
+    ("best_embedding", pa.list_(pa.float32())), ("moved_points", pa.list_(pa.float32())),
 ])  # fmt: skip
+_EVIDENCE = ("evidence", "confidence", "heading", "speed", "times_seen", "first_seen", "last_seen", "agreement")
 _CAMERA = pa.struct([
     ("name", pa.string()), ("K", VECTOR), ("width", pa.int32()), ("height", pa.int32()), ("T_world_cam", VECTOR),
     ("lens", pa.string()), ("distortion", VECTOR),
@@ -106,22 +111,33 @@ def _object_row(node: SceneObject) -> dict[str, Any]:
     same = {name: getattr(node, name) for name in ("id", "level", "parent", "children", "label", "score", "state")}
     views = [{"frame": view.frame, "view": view.view, "box": list(view.box)} for view in node.views]
     box = {"center": node.box.center, "size": node.box.size, "yaw": node.box.yaw}
-    return same | box | {"embedding": node.embedding, "voxels": node.voxels, "views": views}
+    more = {name: getattr(node, name) for name in _EVIDENCE}
+    names = [{"name": name, "score": score} for name, score in node.names]
+    best = None if node.best_embedding is None else node.best_embedding
+    moved = node.points.ravel() if len(node.points) != len(node.voxels) else None  # not those of its voxels
+    return same | box | more | {
+        "embedding": node.embedding, "voxels": node.voxels, "views": views, "names": names, "best_embedding": best,
+        "moved_points": moved,
+    }  # fmt: skip
 
 
 def _object(row: Mapping[str, Any], positions: np.ndarray, voxels: VoxelMap) -> SceneObject:
     embedding = np.asarray(row["embedding"], dtype=np.float32)
     if embedding.shape != (voxels.dim,) or not np.isfinite(embedding).all():
         raise MapError(f"embedding of object {row['id']} is not usable", expected=f"{voxels.dim} finite numbers")
-    same = {name: row[name] for name in ("id", "level", "parent", "label", "score", "state")}
+    same = {name: row[name] for name in ("id", "level", "parent", "label", "score", "state", *_EVIDENCE)}
+    best, moved = row["best_embedding"], row["moved_points"]
+    points = voxels.centers_at(positions) if moved is None else np.reshape(moved, (-1, 3))
     return SceneObject(
         **same,
         box=Box(np.asarray(row["center"]), np.asarray(row["size"]), row["yaw"]),
         voxels=positions.astype(np.int64),
-        points=voxels.centers_at(positions).astype(np.float32),
+        points=points.astype(np.float32),
         embedding=embedding,
         children=tuple(row["children"]),
         views=tuple(Sighting(view["frame"], view["view"], tuple(view["box"])) for view in row["views"]),
+        names=tuple((name["name"], name["score"]) for name in row["names"]),
+        best_embedding=None if best is None else np.asarray(best, dtype=np.float32),
     )
 
 

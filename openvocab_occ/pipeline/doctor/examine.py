@@ -12,7 +12,7 @@ from openvocab_occ.datasets.frame import Frame, FrameSequence
 from openvocab_occ.depth.render import render_depth
 from openvocab_occ.errors import OpenVocabOccError
 from openvocab_occ.io.files import PathLike
-from openvocab_occ.mapping import rows_from_depth, rows_from_grid
+from openvocab_occ.mapping import cover_grid, rows_from_depth, rows_from_grid
 from openvocab_occ.pipeline.build import DEFAULT_VOXEL_SIZE, MAX_DEPTH, grid_of
 from openvocab_occ.pipeline.doctor.cameras import check_intrinsics, check_rig
 from openvocab_occ.pipeline.doctor.files import check_files, check_timestamps
@@ -183,6 +183,7 @@ def _voxels(frame: Frame, size: float | None) -> tuple[set[bytes], float]:
             assert grid is not None
             width = min(view.camera.width, _ESTIMATE_WIDTH)
             camera = view.camera.resized(width, max(1, round(view.camera.height * width / view.camera.width)))
-            keys = rows_from_grid(render_depth(grid, camera, max_depth=MAX_DEPTH), grid, size)[1]
+            flat = rows_from_grid(render_depth(grid, camera, max_depth=MAX_DEPTH), grid)[1]
+            keys = cover_grid(flat, grid, size).keys
         found.update(key.tobytes() for key in keys)
     return found, size
