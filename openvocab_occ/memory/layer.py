@@ -36,6 +36,7 @@ class Layer:
     def __init__(self, store: Store, prefix: str, schema: MapSchema) -> None:
         self.prefix = prefix
         self.schema = schema
+        self._store = store
         self._where = f"{store.name}/{prefix}".rstrip("/")
         spec = {"driver": "zarr3", "kvstore": store.under(prefix), "metadata": array_metadata(schema)}
         with translated(self._where):
@@ -105,16 +106,17 @@ class Layer:
         for attempt in range(_ATTEMPTS):
             transaction = ts.Transaction(repeatable_read=True)
             try:
-                changed = self._stage(transaction, wanted, change)
-                if not any(changed.values()):
-                    transaction.abort()
-                    return sum(counts.values())
-                for key, count in changed.items():
-                    counts[key] = max(counts[key], count)
-                with translated(self._where):
-                    transaction.commit_async().result()
+                with self._store.locked([f"{self.prefix}{chunk_name(key)}" for key in wanted]):
+                    changed = self._stage(transaction, wanted, change)
+                    for key, count in changed.items():
+                        counts[key] = max(counts[key], count)
+                    if any(changed.values()):
+                        with translated(self._where):
+                            transaction.commit_async().result()
+                    else:
+                        transaction.abort()
                 return sum(counts.values())
-            except Conflict:
+            except Conflict:  # in a bucket, or with a writer that is not ours
                 transaction.abort()
                 time.sleep(random.random() * _WAIT * 2 ** min(attempt, 6))
             except BaseException:
@@ -126,12 +128,12 @@ class Layer:
 
     def drop(self, key: TileKey) -> None:
         """Remove a tile."""
-        with translated(self._at(key)):
+        with self._store.locked([f"{self.prefix}{chunk_name(key)}"]), translated(self._at(key)):
             self._kv.write(chunk_name(key), None).result()
 
     def replace(self, tiles: dict[TileKey, Tile]) -> None:
         """Write tiles as they are, whatever was there; durable on return."""
-        with translated(self._where):
+        with self._store.locked([f"{self.prefix}{chunk_name(key)}" for key in tiles]), translated(self._where):
             futures = [_part(self._array, key).write(self._packed(tile)) for key, tile in tiles.items()]
             for future in futures:
                 future.result()

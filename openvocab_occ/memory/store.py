@@ -1,22 +1,32 @@
 """Where a map's bytes lie: a folder, or a bucket. Small values, and the one place that knows TensorStore's errors."""
 
+import errno
 import json
+import os
 import re
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, cast
 from urllib.parse import quote
+from zlib import crc32
 
 import tensorstore as ts
 
-from openvocab_occ.errors import ConfigError, DataError, MapError, NotFoundError, StorageError
+from openvocab_occ.errors import ConfigError, DataError, MapError, NotFoundError, OpenVocabOccError, StorageError
 from openvocab_occ.io.files import PathLike
+
+try:
+    import fcntl
+except ImportError:  # Windows: one process may write
+    fcntl = None
 
 Location = PathLike | Mapping[str, Any]
 """A folder, `s3://bucket/prefix`, `gs://...`, or a TensorStore kvstore spec."""
 
+_LOCKS = ".locks"
+_NUM_LOCKS = 64  # files; tiles that share one wait for each other in vain, rarely
 _FULL = ("os_error_code='27'", "os_error_code='28'", "os_error_code='122'", "No space left", "RESOURCE_EXHAUSTED")
 _READ_ONLY = ("os_error_code='13'", "os_error_code='30'", "os_error_code='1'", "PERMISSION_DENIED", "AccessDenied")
 _DAMAGED = (
@@ -57,8 +67,29 @@ class Store:
 
     def write(self, key: str, value: bytes) -> None:
         """Write a value, whole and durable, or raise and leave what was there."""
-        with translated(f"{self.name}/{key}"):
+        with self.locked([key]), translated(f"{self.name}/{key}"):
             self.kv.write(key, value).result()
+
+    @contextmanager
+    def locked(self, keys: Collection[str]) -> Iterator[None]:
+        """Keep other processes from writing these keys, in a folder; a killed holder's locks open by themselves.
+
+        TensorStore writes to KEY.__lock and renames it, and goes on with one that a killed process left without
+        cutting it off first: a shorter value gets the tail of the longer one. So what is left is removed here.
+        """
+        if self.folder is None or fcntl is None:
+            yield
+            return
+        with ExitStack() as held, refused(self.name):
+            folder = self.folder / _LOCKS
+            folder.mkdir(exist_ok=True)
+            for number in sorted({crc32(key.encode()) % _NUM_LOCKS for key in keys}):  # in order: no two wait in a ring
+                descriptor = os.open(folder / f"{number:02x}", os.O_RDWR | os.O_CREAT, 0o666)
+                held.callback(os.close, descriptor)
+                fcntl.flock(descriptor, fcntl.LOCK_EX)
+            for key in keys:
+                (self.folder / f"{key}.__lock").unlink(missing_ok=True)
+            yield
 
     def delete(self, prefix: str) -> None:
         """Remove every key that begins with `prefix`."""
@@ -103,6 +134,20 @@ def safe_name(name: str, what: str) -> str:
 def agent_number(name: str) -> int:
     """Return the number an agent has in the records: 32 bits of its name's hash, never 0; the same in every map."""
     return int.from_bytes(sha256(name.encode()).digest()[:4], "little") or 1
+
+
+@contextmanager
+def refused(what: str) -> Iterator[None]:
+    """Turn the operating system's refusal into an error of ours."""
+    try:
+        yield
+    except (PermissionError, OSError) as error:
+        if isinstance(error, OpenVocabOccError):
+            raise
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        why = "the disk is full" if full else "it is read-only"
+        fix = "make room, then write again" if full else "check its permissions"
+        raise StorageError(f"{what} cannot be written: {why}", got=error.strerror, fix=fix) from error
 
 
 @contextmanager

@@ -85,7 +85,7 @@ class TileMap:
         """
         schema = MapSchema(tuple(class_names), heights, float(cell), float(z0), dtype, journal)
         store = Store(path, create=True)
-        if store.list(""):
+        if [key for key in store.list("") if not key.startswith(".locks/")]:
             raise AlreadyExistsError(f"{store.name} is not empty", expected="a new path", fix="open it, or remove it")
         group = {"zarr_format": 3, "node_type": "group", "attributes": {}}
         Layer(store, _BASE, schema)

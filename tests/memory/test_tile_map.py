@@ -416,7 +416,7 @@ def test_names_of_any_letters_and_no_way_out_of_the_folder(city, rng):
         write(city, random_logits(rng), np.ones(SPEC.shape, bool), np.eye(4), log=log, agent=log)
     assert set(city.logs()) == {"../../etc", "ä/ö:ü", "a b", "."}
     assert {p.name for p in Path(city.store.name).iterdir()} == {
-        "zarr.json", "base", "logs", "journal", "agents", "registry",
+        "zarr.json", "base", "logs", "journal", "agents", "registry", ".locks",
     }  # fmt: skip
     assert sorted(p.name for p in (Path(city.store.name) / "journal").iterdir()) == sorted(
         ["%2E%2E%2F%2E%2E%2Fetc", "%C3%A4%2F%C3%B6%3A%C3%BC", "a%20b", "%2E"]

@@ -35,6 +35,17 @@ def test_kills_at_random_points_leave_every_chunk_whole(tmp_path):
     assert verify(city).sound
 
 
+def test_what_a_killed_writer_left_does_not_get_into_a_chunk(city, rng):
+    """A longer half-written file beside a chunk, as a kill leaves it, must not become the tail of the next."""
+    mask = np.ones(SPEC.shape, bool)
+    write(city, random_logits(rng), mask, np.eye(4), stamp=1.0)
+    for chunk in (Path(city.store.name) / "logs/one").glob("c.*"):
+        chunk.with_name(chunk.name + ".__lock").write_bytes(rng.bytes(10**6))
+    write(city, random_logits(rng), mask, np.eye(4), stamp=2.0)
+    assert verify(city).sound
+    assert not [*Path(city.store.name).rglob("*.__lock")]
+
+
 def test_torn_chunks_are_told_and_made_anew(city, rng):
     mask = np.ones(SPEC.shape, bool)
     write(city, random_logits(rng), mask, np.eye(4), stamp=1.0)
