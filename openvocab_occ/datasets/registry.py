@@ -39,7 +39,8 @@ def load_sequence(
 
     Args:
         kind: `nuscenes-infos` (mmdetection3d v1.1 info files), `city` (a made-up town; options `seed`, `route`,
-            `traversal`, `condition`, `frames`, `size`) or `street` (a small made-up street; options `seed`, `frames`).
+            `traversal`, `condition`, `frames`, `size`, `quick`) or `street` (a small made-up street; options `seed`,
+            `frames`).
         root: File or folder of the drive.
         scene: Which drive, where the root holds several.
         occupancy: Your own predictions: a file name with {token}, {index}, {scene} or {timestamp}, relative to the

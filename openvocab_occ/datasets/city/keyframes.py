@@ -166,13 +166,17 @@ def labels(drive: Traversal, index: int, instant: Instant | None = None, *, mask
     return Labels(grid, voxels.instances, mask_lidar, mask_camera)
 
 
-def frame(drive: Traversal, index: int, *, size: tuple[int, int] = (704, 256), depth: bool = False, masks: bool = True
+def frame(drive: Traversal, index: int, *, size: tuple[int, int] = (704, 256), depth: bool = False, quick: bool = False
           ) -> Frame:  # fmt: skip
-    """Return a keyframe with images, occupancy and LiDAR; with `depth` also the true depth of every pixel."""
+    """Return a keyframe with images, occupancy and LiDAR; with `depth` also the true depth of every pixel.
+
+    A quick one is for training small models: the world stands still while the cameras fire, edges are not smoothed, and
+    all of the grid counts as known.
+    """
     instant = instant_of(drive, index)
     views, poses = [], {}
     for name, camera, time in drive.cameras(index, size):
-        picture = drive.render(camera, time, instant=instant)
+        picture = drive.render(camera, time, instant=instant, smooth=not quick, frozen=quick)
         views.append(View(picture.image, camera, picture.depth if depth else None, name))
         poses[f"{name.lower()}_ego"] = drive.T_world_ego(time)
     T_world_ego = drive.T_world_ego(index * PERIOD)
@@ -181,7 +185,7 @@ def frame(drive: Traversal, index: int, *, size: tuple[int, int] = (704, 256), d
         timestamp=drive.start_time() + index * PERIOD,
         T_world_ego=T_world_ego,
         views=tuple(views),
-        occupancy=labels(drive, index, instant, masks=masks).grid,
+        occupancy=labels(drive, index, instant, masks=not quick).grid,
         points=transform(T_EGO_LIDAR, sweep(drive, index, instant).points).astype(np.float32),
         token=f"{drive.name}-{index:03d}",
         poses={**poses, "lidar": T_world_ego @ T_EGO_LIDAR},
