@@ -159,6 +159,9 @@ def labels(drive: Traversal, index: int, instant: Instant | None = None, *, mask
     poses = [drive.T_world_ego(n * PERIOD) @ T_EGO_LIDAR for n in stands]
     origins = np.array([T[:3, 3] for T in poses])
     mask_lidar = observed(whole, origins, [lidar_directions_world(thin, T) for T in poses])
+    returns = transform(T_EGO_LIDAR, sweep(drive, index, instant).points)
+    flat = OCC3D_SPEC.flat(OCC3D_SPEC.index(returns))
+    mask_lidar.reshape(-1)[flat[flat >= 0]] = True
     cameras = [camera for _, camera, _ in drive.cameras(index)]
     eyes = np.array([camera.position for camera in cameras])
     mask_camera = observed(whole, eyes, [camera_directions(camera) for camera in cameras]) & mask_lidar
