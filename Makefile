@@ -11,7 +11,7 @@ demo: $(READY)
 	$(BIN)/openvocab-occ demo --out out/demo
 
 test: check
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadscope
 
 check: $(READY)
 	$(BIN)/ruff format --check .

@@ -13,7 +13,7 @@ from openvocab_occ._jit import num_threads
 from openvocab_occ.datasets.registry import load_sequence
 from openvocab_occ.depth.render import render_depth
 from openvocab_occ.pipeline.build import MapBuilder
-from openvocab_occ.segmentation.demo_models import demo_model
+from openvocab_occ.segmentation.demo_models import street_model
 from openvocab_occ.segmentation.onnx import load_encoder
 
 
@@ -25,7 +25,7 @@ def seconds(work: Callable[[], object]) -> float:
 
 def main() -> None:
     frames = list(load_sequence("street"))
-    encoder = load_encoder(demo_model())
+    encoder = load_encoder(street_model())
     builder = MapBuilder(encoder)
     stages: dict[str, list[float]] = {"depth": [], "segmenter": [], "depth, segmenter, lift and fuse": []}
     for frame in frames:

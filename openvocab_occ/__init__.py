@@ -25,12 +25,16 @@ if TYPE_CHECKING:
     from openvocab_occ.geometry.camera import Camera as Camera
     from openvocab_occ.geometry.grid import GridSpec as GridSpec
     from openvocab_occ.mapping.voxel_map import VoxelMap as VoxelMap
+    from openvocab_occ.memory.tile_map import TileMap as TileMap
+    from openvocab_occ.memory.window import Prior as Prior
+    from openvocab_occ.networks.predictor import load_network as load_network
     from openvocab_occ.objects.scene_map import SceneMap as SceneMap
     from openvocab_occ.objects.tree import ObjectTree as ObjectTree
     from openvocab_occ.objects.tree import SceneObject as SceneObject
     from openvocab_occ.occupancy.grid import OccupancyGrid as OccupancyGrid
     from openvocab_occ.occupancy.rays import RayHits as RayHits
     from openvocab_occ.occupancy.rays import cast_rays as cast_rays
+    from openvocab_occ.occupancy.visibility import visibility_mask as visibility_mask
     from openvocab_occ.pipeline.build import MapBuilder as MapBuilder
     from openvocab_occ.pipeline.build import build_map as build_map
     from openvocab_occ.query.find import Answer as Answer
@@ -50,10 +54,12 @@ _HOME = {
     "ObjectTree": "openvocab_occ.objects.tree",
     "OccupancyGrid": "openvocab_occ.occupancy.grid",
     "PixelEncoder": "openvocab_occ.segmentation.encoder",
+    "Prior": "openvocab_occ.memory.window",
     "RayHits": "openvocab_occ.occupancy.rays",
     "SceneMap": "openvocab_occ.objects.scene_map",
     "SceneObject": "openvocab_occ.objects.tree",
     "TextEncoder": "openvocab_occ.segmentation.encoder",
+    "TileMap": "openvocab_occ.memory.tile_map",
     "View": "openvocab_occ.datasets.frame",
     "VoxelMap": "openvocab_occ.mapping.voxel_map",
     "build_map": "openvocab_occ.pipeline.build",
@@ -61,9 +67,11 @@ _HOME = {
     "export_views": "openvocab_occ.export.views",
     "find": "openvocab_occ.query.find",
     "load_encoder": "openvocab_occ.segmentation.onnx",
+    "load_network": "openvocab_occ.networks.predictor",
     "load_sequence": "openvocab_occ.datasets.registry",
     "render_depth": "openvocab_occ.depth.render",
     "view": "openvocab_occ.viewer.server",
+    "visibility_mask": "openvocab_occ.occupancy.visibility",
 }
 __all__ = [*_HOME]  # pyright: ignore[reportUnsupportedDunderAll]
 

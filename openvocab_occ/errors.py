@@ -56,6 +56,10 @@ class MapError(DataError):
     """A saved map that is damaged, from the future, or not a map."""
 
 
+class StorageError(OpenVocabOccError, OSError):
+    """A disk or store that does not take what is written: full, read-only, gone, or fought over."""
+
+
 class EncoderMismatchError(MapError):
     """A query by another encoder than the one that made the map."""
 

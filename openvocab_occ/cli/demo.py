@@ -22,11 +22,11 @@ def demo(*, out: Path = Path("out/demo"), no_view: bool = False, port: int = 808
     from openvocab_occ.export.views import export_views
     from openvocab_occ.pipeline.build import build_map
     from openvocab_occ.query.find import find
-    from openvocab_occ.segmentation.demo_models import demo_model
+    from openvocab_occ.segmentation.demo_models import street_model
     from openvocab_occ.segmentation.onnx import load_encoder
 
     started = time.perf_counter()
-    encoder = load_encoder(demo_model())
+    encoder = load_encoder(street_model())
     with progress("mapping a synthetic street") as advance:
         scene = build_map(load_sequence("street"), encoder, progress=advance)
     path = out / "street.ovmap"

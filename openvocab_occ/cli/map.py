@@ -22,6 +22,7 @@ def build(
     card: Path | None = None,
     voxel_size: float | None = None,
     max_depth: float = 60.0,
+    sandbox: bool = False,
     json: bool = False,
 ) -> None:
     """Turn a drive and an ONNX model into a map.
@@ -33,6 +34,7 @@ def build(
         card: The model's card, if it does not lie beside it as MODEL.card.yaml.
         voxel_size: Edge of a map voxel in metres; that of the occupancy grid by default.
         max_depth: Pixels beyond this z-depth are not lifted, metres.
+        sandbox: Run the model in a child process with limited memory, which can write no file.
         json: Print one JSON object.
     """
     from openvocab_occ.pipeline.build import build_map
@@ -40,7 +42,7 @@ def build(
 
     started = time.perf_counter()
     output_folder(out, marker=MANIFEST)
-    model = load_encoder(encoder, card)
+    model = load_encoder(encoder, card, sandbox=sandbox)
     with progress("mapping") as advance:
         scene = build_map(source.load(), model, voxel_size=voxel_size, max_depth=max_depth, progress=advance)
     scene.save(out)

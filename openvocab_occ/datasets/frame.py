@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, overload
 
 import numpy as np
@@ -77,6 +78,8 @@ class FrameSequence(_Frames):
         *,
         source: str = "",
         synthetic: bool = False,
+        files: Callable[[int], Sequence[Path]] | None = None,
+        info: Mapping[str, str] | None = None,
     ) -> None:
         self.name = name
         """Of the drive."""
@@ -84,6 +87,9 @@ class FrameSequence(_Frames):
         """Kind of the data set."""
         self.synthetic = synthetic
         """True when nobody drove it."""
+        self.info: Mapping[str, str] = dict(info or {})
+        """What else the source says of the drive, such as its location."""
+        self._files = files
         self._indices = indices
         self._read = read
 
@@ -102,9 +108,21 @@ class FrameSequence(_Frames):
     def __iter__(self) -> Iterator[Frame]:
         return map(self._read, self._indices)
 
+    def files(self, index: int) -> Sequence[Path]:
+        """Return the files that frame `index` is read from, without reading them; none where the source cannot tell."""
+        return () if self._files is None else self._files(self._indices[index])
+
     def map(self, change: Callable[[Frame], Frame]) -> "FrameSequence":
         """Return the sequence whose frames are `change(frame)`, each made when it is asked for."""
         return self._like(self._indices, lambda index: change(self._read(index)))
 
     def _like(self, indices: Sequence[int], read: Callable[[int], Frame]) -> "FrameSequence":
-        return FrameSequence(self.name, indices, read, source=self.source, synthetic=self.synthetic)
+        return FrameSequence(
+            self.name,
+            indices,
+            read,
+            source=self.source,
+            synthetic=self.synthetic,
+            files=self._files,
+            info=self.info,
+        )

@@ -14,6 +14,7 @@ from openvocab_occ.geometry import Camera, as_pose, invert, transform
 from openvocab_occ.io.files import PathLike, existing
 from openvocab_occ.io.images import read_image
 from openvocab_occ.io.plain_pickle import read_plain_pickle
+from openvocab_occ.io.sweeps import read_sweep
 
 _MICROSECONDS = 1e12  # a time above this is no number of seconds; some converters leave nuScenes' microseconds
 
@@ -158,16 +159,7 @@ def _points(
 ) -> Float32[np.ndarray, "n 3"]:
     """Read a sweep into the ego frame; returns that are not finite are left out."""
     path = _find(str(_value(lidar, "lidar_path", where)), "LIDAR_TOP", file, f"LiDAR sweep of {where}")
-    columns = int(lidar.get("num_pts_feats", 5))
-    values = np.frombuffer(path.read_bytes()[: path.stat().st_size // 4 * 4], dtype="<f4")
-    if columns < 3 or path.stat().st_size % 4 or len(values) % columns:
-        raise DataError(
-            f"LiDAR sweep {path.name} is cut off or of another kind",
-            expected=f"float32 rows of {columns}",
-            got=f"{path.stat().st_size} bytes",
-        )
-    local = values.reshape(-1, columns)[:, :3]
-    local = local[np.isfinite(local).all(axis=1)]
+    local = read_sweep(path, int(lidar.get("num_pts_feats", 5)))
     return transform(T_ego_lidar, local).astype(np.float32)
 
 

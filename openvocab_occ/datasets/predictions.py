@@ -16,8 +16,8 @@ from openvocab_occ.geometry import GridSpec
 from openvocab_occ.io.files import PathLike, existing
 from openvocab_occ.occupancy import OCC3D_CLASSES, OCC3D_SPEC, OccupancyGrid
 
-GRID_FRAMES = ("lidar_ego", "cam_front_left_ego", "lidar")
-"""Frames of nuScenes grids: ego at LiDAR time (Occ3D), ego at the time of the front left camera, LiDAR."""
+GRID_FRAMES = ("lidar_ego", "cam_front_left_ego", "lidar", "world")
+"""Frames of grids: ego at LiDAR time (Occ3D), ego at the time of the front left camera, LiDAR, or the world itself."""
 PLACEHOLDERS = ("token", "index", "scene", "timestamp")
 OccupancySource = str | Callable[[Frame], OccupancyGrid | np.ndarray | PathLike | None]
 """A pattern of file names, or what gives a frame its grid, array or file; None leaves the frame without."""
@@ -124,7 +124,7 @@ def _check_pattern(pattern: str, frames: int) -> None:
 
 
 def _grid_pose(frame: Frame, name: str) -> np.ndarray:
-    poses = {"lidar_ego": frame.T_world_ego, **frame.poses}
+    poses = {"lidar_ego": frame.T_world_ego, "world": np.eye(4), **frame.poses}
     if name not in poses:
         raise ConfigError(
             f"frame {frame.index} has no pose of the grid frame {name!r}",

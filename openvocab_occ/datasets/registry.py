@@ -14,7 +14,14 @@ from openvocab_occ.occupancy import OCC3D_CLASSES, OCC3D_SPEC
 
 READERS = {
     "city": "openvocab_occ.datasets.city.sequence:load_city",
+    "colmap": "openvocab_occ.datasets.colmap:load_colmap",
+    "kitti": "openvocab_occ.datasets.kitti:load_kitti",
+    "nerfstudio": "openvocab_occ.datasets.nerfstudio:load_nerfstudio",
+    "nuscenes": "openvocab_occ.datasets.nuscenes:load_nuscenes",
     "nuscenes-infos": "openvocab_occ.datasets.nuscenes_infos:load_infos",
+    "recording": "openvocab_occ.datasets.recording:load_recording",
+    "rgbd": "openvocab_occ.datasets.rgbd:load_rgbd",
+    "rosbag": "openvocab_occ.datasets.rosbag:load_rosbag",
     "street": "openvocab_occ.datasets.street:load_street",
 }
 """What reads each kind: `module:function`, called as function(root, scene=..., **options)."""
@@ -38,14 +45,17 @@ def load_sequence(
         load_sequence("city", seed=7, route=0, traversal=1, condition="rain", frames=8)
 
     Args:
-        kind: `nuscenes-infos` (mmdetection3d v1.1 info files), `city` (a made-up town; options `seed`, `route`,
-            `traversal`, `condition`, `frames`, `size`, `quick`) or `street` (a small made-up street; options `seed`,
-            `frames`).
+        kind: One of
+            `nuscenes` (the official tables, Occ3D's `gts/` beside them), `nuscenes-infos` (mmdetection3d v1.1 info
+            files), `kitti` (odometry and SemanticKITTI), `rgbd` (7-Scenes, 3DMatch, TUM, ScanNet exports), `nerfstudio`
+            (transforms.json), `colmap`, `rosbag` (ROS 1, ROS 2, MCAP), `recording` (our own folder, docs/recording.md),
+            `city` (a made-up town, docs/city.md) or `street` (a small made-up street; options `seed`, `frames`). The
+            readers' own docs tell their options.
         root: File or folder of the drive.
         scene: Which drive, where the root holds several.
         occupancy: Your own predictions: a file name with {token}, {index}, {scene} or {timestamp}, relative to the
             root, or a function of the frame that returns a grid, an array or a file. They replace the source's own.
-        occupancy_frame: Frame of those grids: `lidar_ego` (Occ3D), `cam_front_left_ego` or `lidar`.
+        occupancy_frame: Frame of those grids: `lidar_ego` (Occ3D), `cam_front_left_ego`, `lidar` or `world`.
         occupancy_spec: Their lattice.
         occupancy_classes: Their classes.
         occupancy_free: The class that means empty; by default the one named `free`.

@@ -75,21 +75,40 @@ def first_samples(origin, directions, occupied, step, count, start, stop, out_t,
 
 @kernel
 @no_type_check
+def _at(x, y, z, occupied):
+    """Return the flat index of the occupied voxel at a point, or -1."""
+    nx, ny, nz = occupied.shape
+    if not (0.0 <= x < nx and 0.0 <= y < ny and 0.0 <= z < nz) or not occupied[int(x), int(y), int(z)]:
+        return -1
+    return (int(x) * ny + int(y)) * nz + int(z)
+
+
+@kernel
+@no_type_check
 def samples_from_entry(lens, R, origin, occupied, step, count, start, stop, depth, voxel):
     """Turn exact depth, in place, into that of samples, for rows start..stop of a pinhole image (see `PixelRays`).
 
     `depth` holds where each ray enters its first voxel, within float32, and `voxel` is -1 where it enters none.
     """
+    ox, oy, oz = origin[0], origin[1], origin[2]
     for row in range(start, stop):
         y = (row - lens[4]) / lens[3]
         for u in range(depth.shape[1]):
             if voxel[row, u] < 0:
                 continue
             x = ((u - lens[2]) - lens[1] * y) / lens[0]
-            depth[row, u], voxel[row, u] = _first_sample(
-                origin[0], origin[1], origin[2],
-                (R[0, 0] * x + R[0, 1] * y) + R[0, 2],
-                (R[1, 0] * x + R[1, 1] * y) + R[1, 2],
-                (R[2, 0] * x + R[2, 1] * y) + R[2, 2],
-                occupied, step, count, depth[row, u] * (1.0 - 1e-6),
-            )  # fmt: skip
+            dx = (R[0, 0] * x + R[0, 1] * y) + R[0, 2]
+            dy = (R[1, 0] * x + R[1, 1] * y) + R[1, 2]
+            dz = (R[2, 0] * x + R[2, 1] * y) + R[2, 2]
+            begin = depth[row, u] * (1.0 - 1e-6)
+            i = max(int(begin / step), 1)
+            t = i * step
+            hit = _at(ox + t * dx, oy + t * dy, oz + t * dz, occupied)
+            if hit < 0:  # almost always the next one: the first after the entry
+                i += 1
+                t = i * step
+                hit = _at(ox + t * dx, oy + t * dy, oz + t * dz, occupied)
+            if hit >= 0 and i <= count:
+                depth[row, u], voxel[row, u] = t, hit
+            else:
+                depth[row, u], voxel[row, u] = _first_sample(ox, oy, oz, dx, dy, dz, occupied, step, count, begin)

@@ -6,10 +6,10 @@ from jaxtyping import Bool, Float, Int, Int32
 from openvocab_occ._jit import in_slices, num_threads
 from openvocab_occ.depth import _raster_kernels
 from openvocab_occ.depth.image import DepthImage
-from openvocab_occ.depth.pixel_rays import PixelRays
 from openvocab_occ.geometry import Camera
 from openvocab_occ.occupancy import OccupancyGrid
 from openvocab_occ.occupancy._rays_kernels import first_hits
+from openvocab_occ.occupancy.pixel_rays import PixelRays
 
 MIN_CLEARANCE = 0.02
 """Voxels from the camera to the nearest occupied one. Nearer, or inside, faces fill the view edge-on."""

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import overload
+from typing import Literal, get_args, overload
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
@@ -10,29 +10,41 @@ from jaxtyping import Float, Float32, Int, Int32
 from openvocab_occ._jit import in_slices
 from openvocab_occ.depth._sampling_kernels import first_samples, samples_from_entry
 from openvocab_occ.depth.image import DepthImage as DepthImage
-from openvocab_occ.depth.pixel_rays import PixelRays
 from openvocab_occ.depth.raster import can_raster, raster
+from openvocab_occ.depth.smooth import trace_surface
 from openvocab_occ.errors import ConfigError
 from openvocab_occ.geometry import Camera
 from openvocab_occ.occupancy import OccupancyGrid
+from openvocab_occ.occupancy.pixel_rays import PixelRays
 from openvocab_occ.occupancy.rays import lattice_rays, trace_lattice
 
 _GRAIN = 2048  # rays worth a thread
 
 
+Surface = Literal["voxel", "smooth"]
 _Pixels = Int[np.ndarray, " pixels"]
 
 
 @overload
 def render_depth(
-    grid: OccupancyGrid, camera: Camera, *, max_depth: float = ..., step: float | None = ...
+    grid: OccupancyGrid, camera: Camera, *, max_depth: float = ..., step: float | None = ..., surface: Surface = ...
 ) -> DepthImage: ...
 @overload
 def render_depth(
-    grid: OccupancyGrid, camera: Sequence[Camera], *, max_depth: float = ..., step: float | None = ...
+    grid: OccupancyGrid,
+    camera: Sequence[Camera],
+    *,
+    max_depth: float = ...,
+    step: float | None = ...,
+    surface: Surface = ...,
 ) -> list[DepthImage]: ...
 def render_depth(
-    grid: OccupancyGrid, camera: Camera | Sequence[Camera], *, max_depth: float = 100.0, step: float | None = None
+    grid: OccupancyGrid,
+    camera: Camera | Sequence[Camera],
+    *,
+    max_depth: float = 100.0,
+    step: float | None = None,
+    surface: Surface = "voxel",
 ) -> DepthImage | list[DepthImage]:
     """Render the z-depth of the first occupied voxel in each pixel; several cameras give a list.
 
@@ -46,12 +58,21 @@ def render_depth(
         step: None for the exact depth at which the ray enters the voxel (0 when the camera is inside it), by the rules
             of `cast_rays`. Else the paper's sampling (Eq. 5-9): the smallest i step, i = 1, 2, ..., whose point lies in
             an occupied voxel. It is late by up to one step, and misses corners thinner than that.
+        surface: `voxel`: the faces of voxels, a staircase. `smooth`: where `grid.probability`, trilinear between the
+            centres of voxels, first reaches 0.5 (0 where the camera is above it); the voxel is the one of the eight
+            around the point that adds most to it. It has logits to go by, or else smoothed labels.
     """
     _check_length(max_depth, "max_depth")
     if step is not None:
         _check_length(step, "step")
+    if surface not in get_args(Surface):
+        raise ConfigError("surface is not known", expected=" or ".join(get_args(Surface)), got=surface)
+    if surface == "smooth" and step is not None:
+        raise ConfigError("a smooth surface is not sampled", expected="step=None", got=step)
     cameras = [camera] if isinstance(camera, Camera) else list(camera)
-    if step is None:
+    if surface == "smooth":
+        images = [_smooth(grid, one, float(max_depth)) for one in cameras]
+    elif step is None:
         images = [image for image, _ in _exact(grid, cameras, float(max_depth))]
     else:
         images = _sampled(grid, cameras, float(max_depth), float(step))
@@ -86,6 +107,13 @@ def _rays(grid: OccupancyGrid, camera: Camera) -> tuple[Float[np.ndarray, "1 3"]
         return view.origin[None], view.directions(np.arange(camera.height * camera.width))
     rays = camera.rays().reshape(-1, 3) @ camera.T_world_cam[:3, :3].T
     return lattice_rays(grid, camera.position[None], rays)
+
+
+def _smooth(grid: OccupancyGrid, camera: Camera, max_depth: float) -> DepthImage:
+    origins, directions = _rays(grid, camera)
+    depth, voxel = trace_surface(grid, origins[0], directions, max_depth)
+    size = (camera.height, camera.width)
+    return DepthImage(depth.reshape(size), voxel.reshape(size))
 
 
 def _sampled(grid: OccupancyGrid, cameras: Sequence[Camera], max_depth: float, step: float) -> list[DepthImage]:

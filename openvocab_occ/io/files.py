@@ -1,9 +1,11 @@
 """Files: friendly errors when missing, outputs that are whole or not there at all."""
 
+import ctypes
 import difflib
 import hashlib
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -12,6 +14,7 @@ from pathlib import Path
 from openvocab_occ.errors import AlreadyExistsError, ConfigError, NotFoundError
 
 PathLike = str | os.PathLike[str]
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # of Linux
 
 
 def existing(path: PathLike, what: str) -> Path:
@@ -69,6 +72,16 @@ def output_folder(path: PathLike, *, marker: str) -> Path:
     return target
 
 
+def _exchange(a: Path, b: Path) -> bool:
+    """Swap two names in one step where Linux and the file system can, so that a crash finds one or the other."""
+    if not sys.platform.startswith("linux"):
+        return False
+    libc = ctypes.CDLL(None, use_errno=True)
+    if not hasattr(libc, "renameat2"):
+        return False
+    return libc.renameat2(_AT_FDCWD, os.fsencode(a), _AT_FDCWD, os.fsencode(b), _RENAME_EXCHANGE) == 0
+
+
 @contextmanager
 def written_folder(path: PathLike, *, marker: str) -> Generator[Path, None, None]:
     """Yield a temporary sibling of `path` to write into; on success it takes the place of `path`, else it is removed.
@@ -83,7 +96,9 @@ def written_folder(path: PathLike, *, marker: str) -> Generator[Path, None, None
         for child in scratch.rglob("*"):
             fsync(child)
         fsync(scratch)
-        if target.exists():
+        if target.exists() and _exchange(scratch, target):
+            pass  # the old folder is now at `scratch`, and goes below
+        elif target.exists():
             # two renames: a crash between them leaves the old folder beside the name, whole
             old = Path(tempfile.mkdtemp(prefix=f".{target.name}.old.", dir=target.parent))
             target.rename(old / target.name)

@@ -32,13 +32,28 @@ def keys_of(points: Float[np.ndarray, "n 3"], voxel_size: float) -> Int32[np.nda
 
 def packable(keys: Int32[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Tell which keys fit into a packed integer."""
-    return np.all((keys >= _LOWER) & (keys <= _UPPER), axis=1)
+    ok = np.ones(len(keys), dtype=bool)
+    for axis in range(3):
+        ok &= (keys[:, axis] >= _LOWER[axis]) & (keys[:, axis] <= _UPPER[axis])
+    return ok
 
 
 def pack(keys: Int32[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
     """Put x, y, z into 24 + 24 + 16 bits; the integers sort as the keys do, x first."""
-    x, y, z = (keys.astype(np.int64) - [0, _LOWER[1], _LOWER[2]]).T
-    return (x << (_Y_BITS + _Z_BITS)) | (y << _Z_BITS) | z
+    return pack_axes(keys[:, 0], keys[:, 1], keys[:, 2])
+
+
+def pack_axes(
+    x: Int32[np.ndarray, " n"], y: Int32[np.ndarray, " n"], z: Int32[np.ndarray, " n"]
+) -> Int64[np.ndarray, " n"]:
+    """Pack keys given by axis."""
+    packed = x.astype(np.int64)
+    packed <<= _Y_BITS
+    packed += y  # adding the offsets below makes the lower parts positive
+    packed <<= _Z_BITS
+    packed += z
+    packed += (-int(_LOWER[1]) << _Z_BITS) - int(_LOWER[2])
+    return packed
 
 
 def unpack(packed: Int64[np.ndarray, " n"]) -> Int32[np.ndarray, "n 3"]:

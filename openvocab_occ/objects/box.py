@@ -89,3 +89,14 @@ def least_rectangle(points: Float64[np.ndarray, "n 2"]) -> tuple[Float64[np.ndar
     if width > length * (1 + _TIE):
         length, width, yaw = width, length, yaw + np.pi / 2 if yaw <= 0 else yaw - np.pi / 2
     return middle, length, width, yaw
+
+
+def principal_yaw(points: Float64[np.ndarray, "n 2"]) -> float:
+    """Return the angle, in (-pi/2, pi/2], of the direction along which points spread most; 0 for a round spread."""
+    if len(points) < 2:
+        return 0.0
+    (xx, xy), (_, yy) = np.cov(points.T)
+    if np.hypot(xx - yy, 2 * xy) <= _TIE * (xx + yy):
+        return 0.0
+    yaw = 0.5 * float(np.arctan2(2 * xy, xx - yy))
+    return yaw + np.pi if yaw <= -np.pi / 2 else yaw

@@ -1,7 +1,11 @@
-"""`.ovmap`: a scene map as a folder of Parquet files and a manifest that vouches for them."""
+"""`.ovmap`: a scene map as a folder of Parquet files and a manifest that vouches for them.
+
+Voxels are sorted by x, then y, then z, in row groups that know their range of x, so that a region is read without the
+rest. Columns and features are read when they are first asked for; their pages carry checksums.
+"""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -9,41 +13,47 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Float16, Float32
+from jaxtyping import Float, Float32, Int64
 
-from openvocab_occ.errors import AlreadyExistsError, MapError, OpenVocabOccError
+from openvocab_occ.errors import AlreadyExistsError, ConfigError, MapError, OpenVocabOccError, StorageError
 from openvocab_occ.io.files import PathLike, existing, sha256, written_folder
-from openvocab_occ.mapping import VoxelMap
-from openvocab_occ.objects.box import Box
-from openvocab_occ.objects.scene_map import EncoderInfo, KeyFrame, NamedCamera, Provenance, SceneMap
-from openvocab_occ.objects.tree import ObjectTree, SceneObject, Sighting
-from openvocab_occ.segmentation.encoder import Contract
+from openvocab_occ.mapping import FreeSpace, VoxelMap
+from openvocab_occ.mapping.keys import pack_axes, packable
+from openvocab_occ.objects.feature_table import feature_table
+from openvocab_occ.objects.map_rows import frame_table, frames_of, layer_table, layers_of, object_table, objects_of
+from openvocab_occ.objects.scene_map import EncoderInfo, Provenance, SceneMap
+from openvocab_occ.objects.tree import ObjectTree
 
 FORMAT = "openvocab_occ.map"
 VERSION = 1
 MANIFEST = "manifest.json"
-FILES = ("voxels.parquet", "features.parquet", "objects.parquet", "frames.parquet")
-_AXES = {"keys": ("x", "y", "z"), "colors": ("red", "green", "blue")}
-_VOXEL_COLUMNS = ("weight", "agreement", "color_weight", "count", "first_seen", "last_seen", "labels", "label_time",
-                  "label_pixels")  # fmt: skip
-_VECTOR = pa.list_(pa.float64())
-_OBJECTS = pa.schema([
-    ("id", pa.int32()), ("level", pa.string()), ("parent", pa.int32()), ("children", pa.list_(pa.int32())),
-    ("label", pa.string()), ("score", pa.float64()), ("state", pa.string()),
-    ("center", _VECTOR), ("size", _VECTOR), ("yaw", pa.float64()),
-    ("embedding", pa.list_(pa.float32())), ("voxels", pa.list_(pa.int64())),
-    ("views", pa.list_(pa.struct([("frame", pa.int32()), ("view", pa.string()), ("box", pa.list_(pa.int32()))]))),
-])  # fmt: skip
-_CAMERA = pa.struct([
-    ("name", pa.string()), ("K", _VECTOR), ("width", pa.int32()), ("height", pa.int32()), ("T_world_cam", _VECTOR),
-    ("lens", pa.string()), ("distortion", _VECTOR),
-])  # fmt: skip
-_FRAMES = pa.schema([
-    ("index", pa.int64()), ("timestamp", pa.float64()), ("T_world_ego", _VECTOR), ("cameras", pa.list_(_CAMERA)),
-])  # fmt: skip
+FILES = (
+    "voxels.parquet", "features.parquet", "space.parquet", "objects.parquet", "dynamic.parquet", "frames.parquet",
+)  # fmt: skip
+MAX_COSINE_ERROR = 0.01
+"""How far a stored feature may be from the voxel's own, by default: a match of cosine 0.3 moves by at most 0.14, one of
+neighbours that share a vector by what they differ anyway."""
+HASHED_AT_ONCE = 1 << 28
+"""Bytes up to which a file is hashed when the map is opened (0.15 s); larger ones are by `verify_map` and, page by
+page, when they are read."""
+_ROW_GROUP = 1 << 16
+_AXES = ("x", "y", "z")
+_PARTS = {
+    "keys": _AXES, "colors": ("red", "green", "blue"), "normals": ("normal_x", "normal_y", "normal_z"),
+    "view_box": ("left", "top", "right", "bottom"),
+}  # fmt: skip
+_PLAIN = ("weight", "agreement", "color_weight", "count", "first_seen", "last_seen", "labels", "label_time",
+          "label_pixels", "view_frame", "view", "view_score")  # fmt: skip
+_TYPES = {
+    "x": np.int32, "y": np.int32, "z": np.int32, "red": np.uint8, "green": np.uint8, "blue": np.uint8,
+    "normal_x": np.int8, "normal_y": np.int8, "normal_z": np.int8, "labels": np.uint8, "agreement": np.float16,
+    "left": np.int16, "top": np.int16, "right": np.int16, "bottom": np.int16, "view": np.int16,
+    "view_score": np.float16,
+}  # fmt: skip
+_NORMAL_STEP = np.float32(1 / 127)
 
 
-def write_map(scene: SceneMap, path: PathLike) -> Path:
+def write_map(scene: SceneMap, path: PathLike, *, max_cosine_error: float = MAX_COSINE_ERROR) -> Path:
     """Write the folder; see `SceneMap.save`."""
     target = Path(path).expanduser()
     if (target / MANIFEST).is_file() and _manifest_format(target) != FORMAT:
@@ -51,52 +61,68 @@ def write_map(scene: SceneMap, path: PathLike) -> Path:
             f"{target} holds a {MANIFEST} that is not a map's", expected="a map to replace, or no folder",
             fix="choose another output path",
         )  # fmt: skip
-    features = scene.voxels.features
-    stored = features.astype(np.float16)
+    features = feature_table(scene.voxels.features, max_cosine_error)
     tables = {
-        "voxels.parquet": _voxel_table(scene.voxels),
-        "features.parquet": pa.table({"feature": _vectors(stored)}),
-        "objects.parquet": pa.Table.from_pylist([_object_row(node) for node in scene.objects.nodes], _OBJECTS),
-        "frames.parquet": pa.Table.from_pylist([_frame_row(frame) for frame in scene.frames], _FRAMES),
+        "voxels.parquet": _voxel_table(scene.voxels, features.row),
+        "features.parquet": pa.table({"feature": _vectors(features.vectors)}),
+        "space.parquet": _space_table(scene.voxels.free),
+        "objects.parquet": object_table(scene.objects.nodes),
+        "dynamic.parquet": layer_table(scene.dynamic),
+        "frames.parquet": frame_table(scene.frames),
     }
-    with written_folder(target, marker=MANIFEST) as folder:
-        for name in FILES:
-            pq.write_table(tables[name], folder / name, compression="zstd")
-        manifest = {
-            "format": FORMAT,
-            "format_version": VERSION,
-            "frame": "world, z up",
-            "units": "metres, seconds, radians",
-            "voxel_size": scene.voxels.voxel_size,
-            "encoder": asdict(scene.encoder),
-            "class_names": list(scene.class_names),
-            "features": {"dtype": "float16", **rounding_errors(features, stored)},
-            "provenance": asdict(scene.provenance),
-            "counts": {name.removesuffix(".parquet"): tables[name].num_rows for name in FILES},
-            "files": {
-                name: {"sha256": sha256(folder / name), "bytes": (folder / name).stat().st_size} for name in FILES
-            },
-        }
-        (folder / MANIFEST).write_text(json.dumps(manifest, indent=2, allow_nan=False) + "\n")
+    try:
+        with written_folder(target, marker=MANIFEST) as folder:
+            for name in FILES:
+                _write(tables[name], folder / name)
+            manifest = {
+                "format": FORMAT,
+                "format_version": VERSION,
+                "frame": "world, z up",
+                "units": "metres, seconds, radians",
+                "voxel_size": scene.voxels.voxel_size,
+                "encoder": asdict(scene.encoder),
+                "class_names": list(scene.class_names),
+                "num_classes": scene.voxels.num_classes,
+                "features": {
+                    "dtype": "float16",
+                    "max_cosine_error": max_cosine_error,
+                    "worst_cosine_error": features.worst_cosine_error,
+                    "mean_cosine_error": features.mean_cosine_error,
+                },
+                "provenance": asdict(scene.provenance),
+                "counts": {name.removesuffix(".parquet"): tables[name].num_rows for name in FILES},
+                "files": {
+                    name: {"sha256": sha256(folder / name), "bytes": (folder / name).stat().st_size} for name in FILES
+                },
+            }
+            (folder / MANIFEST).write_text(json.dumps(manifest, indent=2, allow_nan=False) + "\n")
+    except OpenVocabOccError:
+        raise
+    except OSError as error:
+        raise StorageError(
+            f"map {target} could not be written", got=error.strerror or error, fix="what was there before is unchanged"
+        ) from error
     return target
 
 
-def read_map(path: PathLike) -> SceneMap:
+def read_map(path: PathLike, *, region: Float[np.ndarray, "2 3"] | None = None) -> SceneMap:
     """Read the folder; see `SceneMap.open`."""
     folder = existing(path, "map")
     manifest = read_manifest(folder)
-    tables = {name: _table(folder, name, manifest) for name in FILES}
+    for name in FILES:
+        _check_file(folder, name, manifest)
     try:
         info = manifest["encoder"]
         encoder = EncoderInfo(**(info | {"labels": tuple(info["labels"])}))
-        voxels = _voxels(tables, float(manifest["voxel_size"]), encoder)
-        nodes = [_object(row, voxels) for row in tables["objects.parquet"].to_pylist()]
-        frames = tuple(_frame(row) for row in tables["frames.parquet"].to_pylist())
+        voxels, rows = _voxels(folder, manifest, encoder, region)
+        nodes = objects_of(_table(folder, "objects.parquet"), voxels, rows, manifest["counts"]["voxels"])
+        frames = frames_of(_table(folder, "frames.parquet"))
+        layers = layers_of(_table(folder, "dynamic.parquet"), encoder.dim)
         names, provenance = tuple(manifest["class_names"]), Provenance(**manifest["provenance"])
-        return SceneMap(voxels, ObjectTree(nodes), encoder, frames, provenance, names)
-    except MapError:
+        return SceneMap(voxels, ObjectTree(nodes), encoder, frames, provenance, names, layers)
+    except (MapError, ConfigError):
         raise
-    except (KeyError, TypeError, ValueError, IndexError, OpenVocabOccError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, OSError, pa.ArrowException, OpenVocabOccError) as error:
         raise MapError(f"map {folder} contradicts itself", got=f"{type(error).__name__}: {error}") from error
 
 
@@ -121,19 +147,6 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     return manifest
 
 
-def rounding_errors(exact: Float32[np.ndarray, "n c"], stored: Float16[np.ndarray, "n c"]) -> dict[str, float]:
-    """Return the worst absolute error and the worst cosine that storing features made; 0 and 1 for none."""
-    if not len(exact):
-        return {"worst_absolute_error": 0.0, "worst_cosine": 1.0}
-    back = stored.astype(np.float32)
-    norms = np.linalg.norm(exact, axis=1) * np.linalg.norm(back, axis=1)
-    cosine = np.divide(np.einsum("nc,nc->n", exact, back), norms, out=np.ones(len(exact), np.float32), where=norms > 0)
-    return {
-        "worst_absolute_error": float(np.abs(exact - back).max()),
-        "worst_cosine": float(min(cosine.min(), 1.0)),
-    }
-
-
 def _manifest_format(folder: Path) -> object:
     try:
         manifest = json.loads((folder / MANIFEST).read_text())
@@ -142,115 +155,186 @@ def _manifest_format(folder: Path) -> object:
     return manifest.get("format") if isinstance(manifest, dict) else None
 
 
-def _table(folder: Path, name: str, manifest: Mapping[str, Any]) -> pa.Table:
-    """Read one file after checking that it is the one the manifest speaks of."""
+def verify_map(path: PathLike) -> dict[str, Any]:
+    """Hash every file and read every page of a map; return what its manifest says, or raise MapError."""
+    folder = existing(path, "map")
+    manifest = read_manifest(folder)
+    for name in FILES:
+        _check_file(folder, name, manifest, hash_all=True)
+    scene = read_map(folder)
+    columns = scene.voxels.columns()
+    features = scene.voxels.features
+    bad = [name for name in ("weight", "agreement", "first_seen", "last_seen") if not np.isfinite(columns[name]).all()]
+    if bad:
+        raise MapError(f"columns of map {folder} are not finite", got=", ".join(bad), fix="rebuild the map")
+    return {**manifest, "voxels": len(features), "bytes": sum(entry["bytes"] for entry in manifest["files"].values())}
+
+
+def _check_file(folder: Path, name: str, manifest: Mapping[str, Any], *, hash_all: bool = False) -> None:
+    """Check that a file is the one the manifest speaks of."""
     path = folder / name
     if not path.is_file():
         raise MapError(f"map {folder} is incomplete", expected=name, got="no such file", fix="copy the whole folder")
     try:
-        said, rows = manifest["files"][name]["sha256"], manifest["counts"][name.removesuffix(".parquet")]
+        said, size, rows = (
+            manifest["files"][name]["sha256"],
+            manifest["files"][name]["bytes"],
+            manifest["counts"][name.removesuffix(".parquet")],
+        )
     except (KeyError, TypeError) as error:
         raise MapError(f"the manifest of map {folder} says nothing of {name}", got=f"missing {error}") from error
-    if sha256(path) != said:
+    have = path.stat().st_size
+    if (hash_all or have <= HASHED_AT_ONCE or have != size) and (digest := sha256(path)) != said:
         raise MapError(
             f"{path} is damaged or was edited",
             expected=f"sha256 {str(said)[:12]}...",
-            got=f"{sha256(path)[:12]}..., {path.stat().st_size} bytes",
+            got=f"{digest[:12]}..., {have} bytes",
             fix="copy it again, or rebuild the map",
         )
     try:
-        table = pq.read_table(path)
+        found = pq.read_metadata(path).num_rows
     except (pa.ArrowInvalid, OSError) as error:
         raise MapError(f"{path} cannot be read", expected="Parquet", got=error) from error
-    if table.num_rows != rows:
-        raise MapError(f"{path} has another number of rows than its manifest says", expected=rows, got=table.num_rows)
-    return table
+    if found != rows:
+        raise MapError(f"{path} has another number of rows than its manifest says", expected=rows, got=found)
+
+
+def _table(folder: Path, name: str, columns: list[str] | None = None, groups: list[int] | None = None) -> pa.Table:
+    """Read columns of a file, checking each page; all row groups, or some."""
+    try:
+        with pq.ParquetFile(folder / name, page_checksum_verification=True) as file:
+            return file.read(columns) if groups is None else file.read_row_groups(groups, columns)
+    except (pa.ArrowException, OSError) as error:
+        raise MapError(f"{folder / name} cannot be read", expected="Parquet", got=error) from error
+
+
+def _write(table: pa.Table, path: Path) -> None:
+    """Write a table; weights differ in every bit and are split by byte, what repeats is put in a dictionary."""
+    split = [name for name in table.column_names if name in ("weight", "color_weight", "view_score", "agreement")]
+    others: Any = [name for name in table.column_names if name not in split]
+    pq.write_table(
+        table, path, compression="zstd", compression_level=6, row_group_size=_ROW_GROUP, write_page_checksum=True,
+        use_dictionary=others, column_encoding=dict.fromkeys(split, "BYTE_STREAM_SPLIT"),
+    )  # fmt: skip
 
 
 def _vectors(array: np.ndarray) -> pa.FixedSizeListArray:
     return pa.FixedSizeListArray.from_arrays(pa.array(array.reshape(-1)), array.shape[1])
 
 
-def _voxel_table(voxels: VoxelMap) -> pa.Table:
-    columns = voxels.columns()
-    data = {axis: voxels.keys[:, i] for i, axis in enumerate(_AXES["keys"])}
-    data |= {axis: columns["colors"][:, i] for i, axis in enumerate(_AXES["colors"])}
-    data |= {name: columns[name] for name in _VOXEL_COLUMNS}
-    return pa.table(data | {"feature": np.arange(len(voxels), dtype=np.int32)})
+def _voxel_table(voxels: VoxelMap, feature: np.ndarray) -> pa.Table:
+    columns = {"keys": voxels.keys, **voxels.columns()}
+    columns["normals"] = np.rint(columns["normals"] / _NORMAL_STEP)
+    if (columns["color_weight"] == columns["weight"]).all():
+        del columns["color_weight"]  # images came with every view
+    data: dict[str, Any] = {}
+    for name, parts in _PARTS.items():
+        data |= {part: columns[name][:, i] for i, part in enumerate(parts)}
+    data |= {name: columns[name] for name in _PLAIN if name in columns}
+    data = {name: np.ascontiguousarray(column, dtype=_TYPES.get(name)) for name, column in data.items()}
+    if voxels.num_classes:
+        data["label_counts"] = _vectors(voxels.label_counts)
+    return pa.table(data | {"feature": feature})
 
 
-def _voxels(tables: Mapping[str, pa.Table], voxel_size: float, encoder: EncoderInfo) -> VoxelMap:
-    table = tables["voxels.parquet"]
-    column = {name: table[name].to_numpy() for name in table.column_names}
-    vectors = tables["features.parquet"]["feature"].combine_chunks()
-    features = vectors.flatten().to_numpy().reshape(len(vectors), -1 if len(vectors) else encoder.dim)
-    row = column["feature"]
-    if len(row) and not 0 <= int(row.min()) <= int(row.max()) < len(features):
-        raise MapError("voxels point to features that are not there", expected=f"0..{len(features) - 1}", got=row.max())
+def _space_table(space: FreeSpace) -> pa.Table:
+    keys, counts = space.blocks
+    return pa.table({axis: keys[:, i] for i, axis in enumerate(_AXES)} | {"counts": _vectors(counts)})
+
+
+def _voxels(
+    folder: Path, manifest: Mapping[str, Any], encoder: EncoderInfo, region: Float[np.ndarray, "2 3"] | None
+) -> tuple[VoxelMap, Int64[np.ndarray, " n"] | None]:
+    """Return the voxels, whose columns are read when asked for, and which rows of the file they are; None for all."""
+    size, name = float(manifest["voxel_size"]), "voxels.parquet"
+    groups = None if region is None else _groups(folder / name, region, size)
+    table = _table(folder, name, list(_AXES), groups)
+    axes = [table[axis].to_numpy().astype(np.int32, copy=False) for axis in _AXES]
+    packed = pack_axes(*axes)
+    ends = np.array([[a.min(initial=0), a.max(initial=0)] for a in axes], dtype=np.int32).T
+    if not packable(ends).all() or (packed[1:] <= packed[:-1]).any():
+        raise MapError("voxel keys repeat, are too large or out of order", got=folder, fix="rebuild the map")
+    inside = rows = None
+    if region is not None and groups is not None:
+        centers = (np.stack(axes, axis=1) + 0.5) * size
+        inside = ((centers >= region[0]) & (centers < region[1])).all(axis=1)
+        with pq.ParquetFile(folder / name) as file:
+            lengths = [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)]
+        first = np.cumsum([0, *lengths])
+        rows = np.concatenate([np.arange(first[g], first[g + 1]) for g in groups] or [first[:0]])[inside]
+        packed = packed[inside]
+    read = _reader(folder, encoder.dim, groups, inside)
+    classes = int(manifest["num_classes"])
+    voxels = VoxelMap.stored(size, encoder.dim, packed, read, contract=encoder.contract, num_classes=classes)
+    space = _table(folder, "space.parquet")
+    blocks = np.stack([space[axis].to_numpy() for axis in _AXES], axis=1).astype(np.int32)
+    voxels.free = FreeSpace.from_blocks(size, blocks, _rows_of(space["counts"], 512))
+    return voxels, rows
+
+
+def _groups(path: Path, region: Float[np.ndarray, "2 3"], size: float) -> list[int]:
+    """Return the row groups whose range of x meets the region."""
+    if region.shape != (2, 3) or not np.isfinite(region).all() or (region[0] >= region[1]).any():
+        raise ConfigError("region is not a box", expected="lower and upper corner, metres", got=region.tolist())
+    low, high = np.floor(region[:, 0] / size)
+    with pq.ParquetFile(path) as file:
+        at = [file.metadata.row_group(i).column(0).statistics for i in range(file.num_row_groups)]
+    return [i for i, x in enumerate(at) if x is None or (x.max >= low and x.min <= high)]
+
+
+def _rows_of(column: pa.ChunkedArray, width: int) -> np.ndarray:
+    """Return a column of vectors as an array."""
+    return column.combine_chunks().flatten().to_numpy(zero_copy_only=False).reshape(-1, width)
+
+
+def _reader(folder: Path, dim: int, groups: list[int] | None, inside: np.ndarray | None) -> Callable[[str], np.ndarray]:
+    """Return what reads a column of the voxels by the name it has in `VoxelMap`."""
+
+    def column(name: str) -> pa.ChunkedArray:
+        table = _table(folder, "voxels.parquet", [name], groups)
+        if name not in table.column_names:
+            raise MapError(f"map {folder} contradicts itself", expected=f"a column {name}", got="none")
+        return table[name]
+
+    def plain(name: str) -> np.ndarray:
+        values = column(name).to_numpy()
+        return values if inside is None else values[inside]
+
+    def read(name: str) -> np.ndarray:
+        if name == "features":
+            row = plain("feature")
+            vectors = _features(folder, dim)
+            if len(row) and not 0 <= int(row.min()) <= int(row.max()) < len(vectors):
+                raise MapError(
+                    "voxels point to features that are not there", expected=f"0..{len(vectors) - 1}", got=row.max()
+                )
+            return vectors[row].astype(np.float32)
+        if name == "label_counts":
+            chunk = column(name)
+            values = _rows_of(chunk, chunk.type.list_size)
+            return values if inside is None else values[inside]
+        if name in _PARTS:
+            values = np.stack([plain(part) for part in _PARTS[name]], axis=1)
+            return values * _NORMAL_STEP if name == "normals" else values
+        if name == "color_weight" and "color_weight" not in pq.read_schema(folder / "voxels.parquet").names:
+            return plain("weight")
+        values = plain(name)
+        return values.astype(np.float32) if name in ("agreement", "view_score") else values.copy()
+
+    return read
+
+
+def _features(folder: Path, dim: int) -> Float32[np.ndarray, "t c"]:
+    """Return the feature table."""
+    vectors = _table(folder, "features.parquet")["feature"]
+    width = vectors.type.list_size
+    features = _rows_of(vectors, width).astype(np.float32)
     bad = int((~np.isfinite(features)).any(axis=1).sum())
-    if bad or features.shape[1] != encoder.dim:
+    if bad or width != dim:
         raise MapError(
             "features of the map are not usable",
-            expected=f"finite vectors of length {encoder.dim}",
-            got=f"length {features.shape[1]}, {bad} of {len(features)} with NaN or infinity",
+            expected=f"finite vectors of length {dim}",
+            got=f"length {width}, {bad} of {len(features)} with NaN or infinity",
             fix="rebuild the map",
         )
-    keys = np.stack([column[axis] for axis in _AXES["keys"]], axis=1)
-    columns = {name: column[name] for name in _VOXEL_COLUMNS}
-    columns["colors"] = np.stack([column[axis] for axis in _AXES["colors"]], axis=1)
-    contract: Contract = encoder.contract
-    return VoxelMap.from_columns(voxel_size, keys, features[row].astype(np.float32), columns, contract=contract)
-
-
-def _object_row(node: SceneObject) -> dict[str, Any]:
-    same = {name: getattr(node, name) for name in ("id", "level", "parent", "children", "label", "score", "state")}
-    views = [{"frame": view.frame, "view": view.view, "box": list(view.box)} for view in node.views]
-    box = {"center": node.box.center, "size": node.box.size, "yaw": node.box.yaw}
-    return same | box | {"embedding": node.embedding, "voxels": node.voxels, "views": views}
-
-
-def _object(row: Mapping[str, Any], voxels: VoxelMap) -> SceneObject:
-    positions = np.asarray(row["voxels"], dtype=np.int64)
-    if len(positions) and not 0 <= int(positions.min()) <= int(positions.max()) < len(voxels):
-        raise MapError(f"object {row['id']} holds voxels that are not there", expected=f"0..{len(voxels) - 1}")
-    embedding = np.asarray(row["embedding"], dtype=np.float32)
-    if embedding.shape != (voxels.dim,) or not np.isfinite(embedding).all():
-        raise MapError(f"embedding of object {row['id']} is not usable", expected=f"{voxels.dim} finite numbers")
-    same = {name: row[name] for name in ("id", "level", "parent", "label", "score", "state")}
-    return SceneObject(
-        **same,
-        box=Box(np.asarray(row["center"]), np.asarray(row["size"]), row["yaw"]),
-        voxels=positions,
-        points=voxels.centers[positions].astype(np.float32),
-        embedding=embedding,
-        children=tuple(row["children"]),
-        views=tuple(Sighting(view["frame"], view["view"], tuple(view["box"])) for view in row["views"]),
-    )
-
-
-def _frame_row(frame: KeyFrame) -> dict[str, Any]:
-    cameras = [
-        {
-            "name": camera.name, "K": camera.K.ravel(), "width": camera.width, "height": camera.height,
-            "T_world_cam": camera.T_world_cam.ravel(), "lens": camera.lens, "distortion": camera.distortion,
-        }
-        for camera in frame.cameras
-    ]  # fmt: skip
-    ego = frame.T_world_ego.ravel()
-    return {"index": frame.index, "timestamp": frame.timestamp, "T_world_ego": ego, "cameras": cameras}
-
-
-def _frame(row: Mapping[str, Any]) -> KeyFrame:
-    cameras = tuple(
-        NamedCamera(
-            np.reshape(camera["K"], (3, 3)),
-            camera["width"],
-            camera["height"],
-            np.reshape(camera["T_world_cam"], (4, 4)),
-            tuple(camera["distortion"]),
-            camera["lens"],
-            camera["name"],
-        )
-        for camera in row["cameras"]
-    )
-    return KeyFrame(row["index"], row["timestamp"], np.reshape(row["T_world_ego"], (4, 4)), cameras)
+    return features

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from openvocab_occ.geometry import Camera, as_pose
 from openvocab_occ.io.files import PathLike
-from openvocab_occ.mapping import VoxelMap
+from openvocab_occ.mapping import DynamicLayer, VoxelMap
 from openvocab_occ.objects.tree import ObjectTree
 from openvocab_occ.segmentation.encoder import Contract, PixelEncoder
 
@@ -97,22 +97,34 @@ class SceneMap:
     provenance: Provenance = field(default_factory=Provenance)
     class_names: tuple[str, ...] = ()
     """Names of the occupancy classes in `voxels.labels`."""
+    dynamic: tuple[DynamicLayer, ...] = ()
+    """What moved, frame by frame; none of it is in `voxels`."""
 
-    def save(self, path: PathLike) -> Path:
-        """Write a `.ovmap` folder, whole or not at all; an older map at `path` is replaced, any other folder is not."""
-        from openvocab_occ.objects.ovmap import write_map
+    def save(self, path: PathLike, *, max_cosine_error: float | None = None) -> Path:
+        """Write a `.ovmap` folder, whole or not at all; an older map at `path` is replaced, any other folder is not.
 
-        return write_map(self, path)
+        Voxels whose features differ by at most `max_cosine_error` (1 - cosine; None for the usual bound) may share one
+        vector; 0 stores every voxel's own. The manifest states the worst error made. Raises StorageError when the
+        disk is full.
+        """
+        from openvocab_occ.objects.ovmap import MAX_COSINE_ERROR, write_map
+
+        bound = MAX_COSINE_ERROR if max_cosine_error is None else max_cosine_error
+        return write_map(self, path, max_cosine_error=bound)
 
     @classmethod
-    def open(cls, path: PathLike) -> "SceneMap":
-        """Read a `.ovmap` folder; every file is checked against the manifest's sha256.
+    def open(cls, path: PathLike, *, region: Float[np.ndarray, "2 3"] | None = None) -> "SceneMap":
+        """Read a `.ovmap` folder; columns and features of the voxels when they are first asked for.
+
+        With a `region` (lower and upper corner, metres) only the voxels whose centres it holds; objects of which it
+        holds none are left out. Every file is checked against the manifest's sha256; those above 256 MB page by page
+        as they are read.
 
         Raises NotFoundError where there is no folder, MapError where it is damaged, from the future, or no map.
         """
         from openvocab_occ.objects.ovmap import read_map
 
-        return read_map(path)
+        return read_map(path, region=region)
 
     def __repr__(self) -> str:
         made = "synthetic " if self.provenance.synthetic else ""

@@ -1,7 +1,7 @@
 """Objects, and the tree they stand in: the scene at its root, objects below it."""
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence, Set
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +10,9 @@ from jaxtyping import Float32, Float64, Int64
 from openvocab_occ.errors import ConfigError, DataError
 from openvocab_occ.objects.box import Box
 
-SCENE, OBJECT = "scene", "object"
+SCENE, REGION, GROUP, OBJECT, PART = "scene", "region", "group", "object", "part"
+LEVELS = (SCENE, REGION, GROUP, OBJECT, PART)
+"""From the root down."""
 
 
 class Sighting(NamedTuple):
@@ -36,7 +38,7 @@ class SceneObject:
     box: Box
     voxels: Int64[np.ndarray, " n"] = field(repr=False)
     """Positions in the VoxelMap of the same SceneMap; none for the scene, which holds all."""
-    points: Float32[np.ndarray, "n 3"] = field(repr=False)
+    points: Float32[np.ndarray, "p 3"] = field(repr=False)
     """Centres of the voxels in the world, metres. Rounded by up to 0.03 mm at 1 km."""
     embedding: Float32[np.ndarray, " c"] = field(repr=False)
     """Mean feature of the voxels; a unit vector for a `dense` map, a distribution for a `logits` map."""
@@ -46,7 +48,32 @@ class SceneObject:
     parent: int | None = None
     children: tuple[int, ...] = ()
     views: tuple[Sighting, ...] = ()
-    """Best sightings; empty where the map was built without recording them."""
+    """Best sightings, best first; empty where the map was built without recording them."""
+    evidence: str = ""
+    """What speaks for `state`, in words."""
+    confidence: float = 0.0
+    """How sure the state is, 0 to 1; not a probability."""
+    heading: float | None = None
+    """Direction it moved in, radians against the world's x axis; None where no motion told front from back."""
+    speed: float = 0.0
+    """Metres a second at the end of its observation."""
+    times_seen: int = 0
+    """Frames it was seen in."""
+    first_seen: float = 0.0
+    """Time of its first sighting, seconds."""
+    last_seen: float = 0.0
+    """Time of its last sighting, seconds."""
+    best_embedding: Float32[np.ndarray, " c"] | None = field(default=None, repr=False)
+    """As `embedding`, of its best views only; None where none were recorded."""
+    agreement: float = 0.0
+    """How far its sightings agree: length of their mean feature, 1 when all are the same."""
+    names: tuple[tuple[str, float], ...] = ()
+    """Best words of a vocabulary and their scores, best first."""
+
+    @property
+    def time_observed(self) -> float:
+        """Seconds from its first to its last sighting."""
+        return self.last_seen - self.first_seen
 
     @property
     def center(self) -> Float64[np.ndarray, " 3"]:
@@ -84,6 +111,21 @@ class ObjectTree:
         """Return the nodes of a level; none when the tree has no such level."""
         return tuple(node for node in self._nodes.values() if node.level == name)
 
+    def walk(self, id: int = 0) -> Iterator[tuple[int, SceneObject]]:
+        """Yield a node and all below it with their depth below it, each before its children."""
+        todo = [(0, id)]
+        while todo:
+            depth, here = todo.pop()
+            yield depth, self[here]
+            todo += [(depth + 1, child) for child in reversed(self[here].children)]
+
+    def region_of(self, id: int) -> SceneObject | None:
+        """Return the region a node is in; None for one in none."""
+        node: SceneObject | None = self[id]
+        while node is not None and node.level != REGION:
+            node = None if node.parent is None else self[node.parent]
+        return node
+
     def __len__(self) -> int:
         return len(self.level(OBJECT))
 
@@ -100,3 +142,24 @@ class ObjectTree:
 
     def __repr__(self) -> str:
         return f"ObjectTree({len(self)} objects)"
+
+
+def without(nodes: Sequence[SceneObject], gone: Set[int]) -> list[SceneObject]:
+    """Return the nodes without those whose id is `gone`, unless something below them stays.
+
+    Nodes that lose all that was below them go too, but for the root.
+    """
+    by_id = {node.id: node for node in nodes}
+    kept: set[int] = {0}
+    for node in nodes:
+        if node.id in gone or (node.children and not len(node.voxels)):
+            continue
+        up: int | None = node.id
+        while up is not None and up not in kept:
+            kept.add(up)
+            up = by_id[up].parent if up in by_id else None
+    return [
+        replace(node, children=tuple(child for child in node.children if child in kept))
+        for node in nodes
+        if node.id in kept
+    ]

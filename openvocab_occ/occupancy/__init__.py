@@ -12,3 +12,6 @@ from openvocab_occ.occupancy.occ3d import read_occ3d_masks as read_occ3d_masks
 from openvocab_occ.occupancy.occ3d import write_occ3d as write_occ3d
 from openvocab_occ.occupancy.rays import RayHits as RayHits
 from openvocab_occ.occupancy.rays import cast_rays as cast_rays
+from openvocab_occ.occupancy.visibility import Visibility as Visibility
+from openvocab_occ.occupancy.visibility import observe as observe
+from openvocab_occ.occupancy.visibility import visibility_mask as visibility_mask

@@ -9,7 +9,9 @@ from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 from openvocab_occ.arrays import ArrayLike, check_finite, check_shape
 from openvocab_occ.errors import GridError, ShapeError
 from openvocab_occ.geometry import GridSpec, as_pose, transform
+from openvocab_occ.occupancy._rays_kernels import mark_blocks
 from openvocab_occ.occupancy.faces import exposed_faces
+from openvocab_occ.occupancy.field import probability_from_labels, probability_from_logits
 
 OCC3D_CLASSES: tuple[str, ...] = (
     "others", "barrier", "bicycle", "bus", "car", "construction vehicle", "motorcycle", "pedestrian", "traffic cone",
@@ -111,6 +113,25 @@ class OccupancyGrid:
     def faces(self) -> Int32[np.ndarray, "n 6"]:
         """The surface of what is occupied, as rectangles; see `exposed_faces`. Made once, on first use."""
         return exposed_faces(self.occupied)
+
+    @cached_property
+    def blocks(self) -> UInt8[np.ndarray, "bx by bz"]:
+        """1 where a block of 8 x 8 x 8 voxels holds an occupied one: what rays through large grids leap by."""
+        x, y, z = self.spec.shape
+        blocks = np.zeros(((x + 7) // 8, (y + 7) // 8, (z + 7) // 8), np.uint8)
+        mark_blocks(self.occupied, blocks)
+        return blocks
+
+    @cached_property
+    def probability(self) -> Float32[np.ndarray, "x y z"]:
+        """Probability at the centre of each voxel that it is occupied: of the logits, or of smoothed labels.
+
+        0 where nothing is known. Smoothed labels are no probabilities, but their level 0.5 is a surface all the same.
+        """
+        if self.logits is None:
+            return probability_from_labels(self.occupied, self.known)
+        field = probability_from_logits(self.logits, self.free_label)
+        return field if self.known is None else np.where(self.known, field, np.float32(0.0))
 
     def centers(self, flat: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
         """Return the centres of voxels given by flat index, metres in the world, float64."""

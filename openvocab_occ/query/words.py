@@ -19,6 +19,17 @@ STOP_WORDS = frozenset({
     "on", "or", "please", "show", "some", "that", "the", "there", "these", "this", "those", "to", "where", "which",
 })  # fmt: skip
 """Words that say nothing about the kind of thing. Negations are not among them: they are reported as not understood."""
+SYNONYMS = (
+    "person, pedestrian, human, man, woman, people, walker, somebody", "car, automobile, auto, sedan, hatchback",
+    "truck, lorry", "bus, coach", "bicycle, bike, cycle, pushbike", "motorcycle, motorbike, moped, scooter",
+    "road, street, roadway, carriageway, driveable surface, drivable surface, asphalt road",
+    "sidewalk, pavement, footpath, footway, walkway", "building, house", "vegetation, tree, bush, plant, greenery",
+    "traffic sign, road sign, street sign", "traffic light, traffic signal, stoplight", "traffic cone, cone, pylon",
+    "couch, sofa", "tv, television, tvmonitor, screen", "airplane, aeroplane, plane", "boat, ship", "dog, puppy",
+    "cat, kitten", "table, diningtable", "construction vehicle, excavator, digger, bulldozer", "terrain, grass, lawn",
+    "pole, post, lamppost", "wall, barricade", "fence, railing", "barrier, roadblock", "trash can, bin, rubbish bin",
+)  # fmt: skip
+"""Words for the same kind of thing, for maps of labels; a `dense` model knows such things itself."""
 _WORD = re.compile(r"[^\W_]+")
 _LONGEST_LABEL = 5  # words
 
@@ -51,15 +62,19 @@ def checked_text(text: str) -> str:
 
 
 def match_labels(text: str, labels: Sequence[str]) -> Match:
-    """Read a text as labels, longest first; case, hyphens and spaces within a label do not matter."""
-    words = _words(text)
+    """Read a text as labels or words for the same thing, longest first; case, hyphens and spaces do not matter."""
+    words = text_words(text)
     known = _by_form(tuple(labels))
     channels = np.zeros(len(labels), dtype=bool)
     unknown: list[str] = []
     at = 0
     while at < len(words):
         for length in range(min(_LONGEST_LABEL, len(words) - at), 0, -1):
-            found = {label for form in _forms(words[at : at + length]) for label in known.get(form, ())}
+            forms = _forms(words[at : at + length])
+            found = {label for form in forms for label in known.get(form, ())}
+            if not found:
+                same = {other for form in forms for other in _synonyms().get(form, ())}
+                found = {label for form in same for label in known.get(form, ())}
             if found:
                 channels[list(found)] = True
                 at += length
@@ -75,8 +90,17 @@ def match_labels(text: str, labels: Sequence[str]) -> Match:
     return Match(channels, tuple(unknown), {word: tuple(found) for word, found in near.items() if found})
 
 
-def _words(text: str) -> list[str]:
+def text_words(text: str) -> list[str]:
+    """Return the words of a text without case, punctuation and compatibility forms."""
     return _WORD.findall(unicodedata.normalize("NFKC", text).casefold())
+
+
+def label_forms(labels: Sequence[str], words: Sequence[str]) -> bool:
+    """Tell whether words, in any inflection, are one of the labels."""
+    if not labels:
+        return False
+    known = _by_form(tuple(labels))
+    return any(form in known for form in _forms(words))
 
 
 @lru_cache(maxsize=8)
@@ -84,7 +108,7 @@ def _by_form(labels: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
     """Map every form of every label to the channels that have it."""
     known: dict[str, tuple[int, ...]] = {}
     for channel, label in enumerate(labels):
-        for form in _forms(_words(label)):
+        for form in _forms(text_words(label)):
             known[form] = (*known.get(form, ()), channel)
     return known
 
@@ -94,6 +118,30 @@ def _forms(words: Sequence[str]) -> set[str]:
     if not words:
         return set()
     return {"".join(choice) for choice in itertools.product(*map(lemmas, words))}
+
+
+@lru_cache(maxsize=1)
+def _synonyms() -> dict[str, frozenset[str]]:
+    """Map each form to the forms of the same meaning."""
+    same: dict[str, frozenset[str]] = {}
+    for line in SYNONYMS:
+        forms = frozenset("".join(text_words(name)) for name in line.split(", "))
+        for form in forms:
+            same[form] = same.get(form, frozenset()) | forms
+    return same
+
+
+@lru_cache(maxsize=4096)
+def singular(text: str) -> str:
+    """Return a noun phrase with its last word in the singular: text encoders learnt most names so."""
+    from lemminflect import getLemma
+
+    words = text.split()
+    if not words:
+        return text
+    last = words[-1]
+    found = "person" if last == "people" else next(iter(getLemma(last, upos="NOUN", lemmatize_oov=False)), last)
+    return " ".join([*words[:-1], found])
 
 
 @lru_cache(maxsize=4096)

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Int32, UInt8
 
 Contract = Literal["dense", "logits"]
+"""What reaches the map: unit features aligned to words, or probabilities of labels. Cards know more ways there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,11 +19,34 @@ class FeatureMap:
     """
 
     cells: Float32[np.ndarray, "h w c"]
-    """Unit features of a `dense` model; class probabilities of a `logits` model."""
+    """Unit features of a `dense` model, zero where it says nothing; class probabilities of a `logits` model."""
     scale: tuple[float, float]
     """Cells a pixel, along u and v."""
     offset: tuple[float, float]
     """Cell coordinate of pixel (0, 0)."""
+
+
+@dataclass(frozen=True, eq=False)
+class MaskMap:
+    """What a mask model says about one image: which mask each cell belongs to, and one vector a mask.
+
+    Far smaller than features a cell: a mapper can keep the numbers of masks and look vectors up once.
+    """
+
+    ids: Int32[np.ndarray, "h w"]
+    """Row of `embeddings`; -1 where no mask is."""
+    embeddings: Float32[np.ndarray, "q c"]
+    """Unit vectors."""
+    scores: Float32[np.ndarray, " q"]
+    """How sure the model is of each mask, 0 to 1."""
+    scale: tuple[float, float]
+    """Cells a pixel, as in FeatureMap."""
+    offset: tuple[float, float]
+
+    def densify(self) -> FeatureMap:
+        """Return each cell's own vector, zero where no mask is, as any mapper understands it."""
+        table = np.concatenate([self.embeddings, np.zeros((1, self.embeddings.shape[1]), np.float32)])
+        return FeatureMap(table[self.ids], self.scale, self.offset)  # -1 is the last row
 
 
 @runtime_checkable
@@ -38,7 +62,11 @@ class TextEncoder(Protocol):
 
 @runtime_checkable
 class PixelEncoder(Protocol):
-    """Images to cells."""
+    """Images to cells.
+
+    Two attributes are optional: `scoring`, a segmentation.scoring.Scoring that turns cosines into scores, and
+    `encode_masks(images) -> list[MaskMap]` of models that put out masks.
+    """
 
     name: str
     contract: Contract

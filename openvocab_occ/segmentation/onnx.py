@@ -2,38 +2,54 @@
 
 import hashlib
 from collections.abc import Sequence
+from functools import cached_property
 from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from openvocab_occ.errors import ModelError
+from openvocab_occ.errors import ConfigError, ModelError
 from openvocab_occ.io.files import PathLike, existing, sha256
-from openvocab_occ.segmentation.card import Card, InputCard, find_card, read_card
-from openvocab_occ.segmentation.encoder import Contract, FeatureMap, PixelEncoder, TextEncoder
-from openvocab_occ.segmentation.session import Port, Session
+from openvocab_occ.segmentation import crops
+from openvocab_occ.segmentation.card import Card, CropCard, FilesCard
+from openvocab_occ.segmentation.card_files import AnyCard, find_card, read_card
+from openvocab_occ.segmentation.declared import check_declared
+from openvocab_occ.segmentation.encoder import Contract, FeatureMap, MaskMap, PixelEncoder, TextEncoder
+from openvocab_occ.segmentation.feature_files import FeatureFileEncoder, MaskFiles
+from openvocab_occ.segmentation.masks import cell_place, mixed, parted, read_masks
+from openvocab_occ.segmentation.outputs import Reader
+from openvocab_occ.segmentation.picture import Placed, colour, place
+from openvocab_occ.segmentation.picture import prepare as prepare
+from openvocab_occ.segmentation.scoring import Scoring, scoring_of
+from openvocab_occ.segmentation.session import CPU, Limits, Session
 from openvocab_occ.segmentation.text import OnnxTextEncoder
+from openvocab_occ.segmentation.tiles import run_in_tiles
 
 _BATCH = 8  # images a run, so that many large images do not fill the memory
-_PROBABILITY_TOLERANCE = 0.02  # quantised models round their softmax
-_NORM_TOLERANCE = 0.01
+_CARDS = (".yaml", ".yml", ".json")
 
 
 def load_encoder(
     onnx: PathLike,
-    card: PathLike | Card | None = None,
+    card: PathLike | AnyCard | None = None,
     *,
-    providers: Sequence[str] = ("CPUExecutionProvider",),
+    providers: Sequence[str] = (CPU,),
     threads: int | None = None,
+    limits: Limits | None = None,
+    sandbox: bool = False,
 ) -> PixelEncoder:
     """Open a model: its structure is inspected, then checked against its card.
 
     Args:
-        onnx: The model file.
-        card: Its card. By default `name.card.yaml` beside `name.onnx`, else the shipped card for this very file.
-        providers: Of onnxruntime, best first.
+        onnx: The model file; or, for features computed elsewhere, their card (contract `files`).
+        card: Its card. By default `name.card.yaml` beside `name.onnx`, else the one inside it, else the shipped card
+            for this very file.
+        providers: Of onnxruntime, best first: `cpu`, `cuda`, `tensorrt`, or its own names. What is not there is left
+            out with a warning.
         threads: For onnxruntime; by default all cores.
+        limits: On size and time.
+        sandbox: Run the model in a child process with limited memory, which can write no file.
 
     Raises:
         CardError: There is no card, or it is not right in itself.
@@ -41,168 +57,184 @@ def load_encoder(
         UnsafeFileError: It reaches outside its folder, or needs foreign operators.
     """
     path = existing(onnx, "ONNX model")
-    session = Session(path, providers=providers, threads=threads)
+    if sandbox:
+        from openvocab_occ.segmentation.sandbox import SandboxedEncoder
+
+        if card is not None and not isinstance(card, str | Path):
+            raise ConfigError("a sandboxed model needs its card as a file", got=type(card).__name__)
+        return SandboxedEncoder(path, None if card is None else Path(card), threads=threads)
+    if path.suffix in _CARDS:
+        files = read_card(path)
+        if not isinstance(files, FilesCard):
+            raise ModelError(
+                f"{path.name} is a card of a model", expected="its ONNX file", fix="pass the model; the card by card="
+            )
+        text = _text(files, path.parent, providers, threads, limits)
+        return FeatureFileEncoder(files, path.parent, text, source=path)
+    session = Session(path, providers=providers, threads=threads, limits=limits)
+    found, folder = _card(card, session)
+    return OnnxEncoder(found, session, _text(found, folder, providers, threads, limits), folder=folder)
+
+
+def _card(card: PathLike | AnyCard | None, session: Session) -> tuple[Card, Path]:
+    folder = session.path.parent
     if card is None:
-        card, folder = find_card(path)
-    elif isinstance(card, Card):
-        folder = path.parent
+        found, folder = find_card(session.path, session.embedded_card)
+    elif isinstance(card, Card | FilesCard):
+        found = card
     else:
-        card, folder = read_card(card), Path(card).parent
-    text = None
-    if card.text is not None:
-        text = OnnxTextEncoder(card.text, folder, providers=providers, threads=threads)
-    return OnnxEncoder(card, session, text)
+        found, folder = read_card(card), Path(card).parent
+    if isinstance(found, FilesCard):
+        raise ModelError(f"card {found.name!r} is for feature files, not for {session.path.name}", fix="pass the card")
+    return found, folder
+
+
+def _text(
+    card: AnyCard, folder: Path, providers: Sequence[str], threads: int | None, limits: Limits | None
+) -> OnnxTextEncoder | None:
+    if card.text is None:
+        return None
+    options = {"providers": providers, "threads": threads, "limits": limits}
+    return OnnxTextEncoder(card.text, folder, prompts=card.prompts, **options)
 
 
 class OnnxEncoder:
     """Images to cells by an ONNX model; see PixelEncoder."""
 
-    def __init__(self, card: Card, session: Session, text: OnnxTextEncoder | None) -> None:
+    def __init__(self, card: Card, session: Session, text: OnnxTextEncoder | None, *, folder: Path) -> None:
         self.card = card
         self.name = card.name
-        self.contract: Contract = card.contract
+        self.contract: Contract = "logits" if card.contract == "logits" else "dense"
         self.labels = card.labels
         self.text: TextEncoder | None = text
         self.dim = len(card.labels) if text is None else text.dim
-        self._session = session
+        self.session = session
         self._input = session.input(card.input.name)
-        self._output = session.output(card.output.name)
-        self._check_declared()
-        self.fingerprint = _fingerprint(card, (*session.files, *(text.files if text is not None else ())))
+        self._reader = Reader(card=card.output, dim=self.dim, model=session.path.name, from_text=text is not None)
+        check_declared(card, session, self._reader)
+        self._proposals = _Proposals.of(card.crops, folder, session) if card.contract == "crops" else None
+        files = (*session.files, *(text.files if text is not None else ()))
+        self.fingerprint = _fingerprint(card, (*files, *(self._proposals.files if self._proposals else ())))
+
+    @cached_property
+    def scoring(self) -> Scoring | None:
+        """How cosines become scores; None for a `logits` model, whose cells are scores."""
+        return None if self.text is None else scoring_of(self.card.score, self.text)
 
     def encode(self, images: Sequence[UInt8[np.ndarray, "_ _ 3"]]) -> list[FeatureMap]:
         """Run the model on RGB images of any sizes."""
-        batch = self._input.shape[0] or _BATCH
-        maps: list[FeatureMap] = []
-        for _, group in groupby(images, key=lambda image: image.shape):
-            same = list(group)
-            for start in range(0, len(same), batch):
-                maps += self._encode_same_size(same[start : start + batch])
-        return maps
+        if self.card.contract == "crops":
+            if self._proposals is not None and self._proposals.given:
+                return [found.densify() for found in self.encode_masks(images)]
+            return [crops.encode_windows(image, self.card.crops or CropCard(), self._embed) for image in images]
+        if self.card.input.tile is not None:
+            return [self._in_tiles(place(image, self.card.input)) for image in images]
+        return [found for part in self._batches(images) for found in self._encode_same_size(part)]
 
-    def _encode_same_size(self, images: Sequence[UInt8[np.ndarray, "h w 3"]]) -> list[FeatureMap]:
-        height, width = images[0].shape[:2]
-        fed = np.stack([prepare(image, self.card.input) for image in images])
-        raw = self._session.run(self._output.name, {self._input.name: self._as_input(fed)})
-        cells = self._cells(raw, len(images))
-        scale = (cells.shape[2] / width, cells.shape[1] / height)
-        offset = (0.5 * scale[0] - 0.5, 0.5 * scale[1] - 0.5)  # cell = (u + 0.5) scale - 0.5
-        return [FeatureMap(one, scale, offset) for one in cells]
+    def encode_masks(self, images: Sequence[UInt8[np.ndarray, "_ _ 3"]]) -> list[MaskMap]:
+        """Return masks and one vector each, of a `masks` model or of crops around given masks; else ModelError."""
+        if self.card.contract == "masks":
+            runs = ((part, self._masks(part)) for part in self._batches(images))
+            return [
+                parted(*found, cell_place(placed, found[0].shape[:2]))
+                for part, results in runs
+                for placed, found in zip(part, results, strict=True)
+            ]
+        if self._proposals is None or not self._proposals.given:
+            raise ModelError(f"model {self.name} puts out no masks", expected="contract masks, or crops of given masks")
+        card = self.card.crops or CropCard()
+        found = zip(images, self._proposals(images), strict=True)
+        return [crops.encode_masks(image, proposals, card, self._embed) for image, proposals in found]
 
-    def _as_input(self, fed: Float32[np.ndarray, "n h w 3"]) -> np.ndarray:
+    def _batches(self, images: Sequence[UInt8[np.ndarray, "_ _ 3"]]) -> list[list[Placed]]:
+        """Return the images as the model wants them, in runs of one size."""
+        size = self._input.shape[0] or _BATCH
+        groups = (list(g) for _, g in groupby((place(i, self.card.input) for i in images), key=lambda p: p.fed.shape))
+        return [group[at : at + size] for group in groups for at in range(0, len(group), size)]
+
+    def _encode_same_size(self, part: Sequence[Placed]) -> list[FeatureMap]:
+        if self.card.contract == "masks":
+            found = zip(part, self._masks(part), strict=True)
+            return [mixed(*one, cell_place(placed, one[0].shape[:2])) for placed, one in found]
+        cells = self._cells(np.stack([placed.fed for placed in part]))
+        return [FeatureMap(one, *cell_place(placed, one.shape[:2])) for placed, one in zip(part, cells, strict=True)]
+
+    def _in_tiles(self, placed: Placed) -> FeatureMap:
+        assert self.card.input.tile is not None, "only called then"
+        unit = self.contract == "dense"
+        cells, span = run_in_tiles(placed.fed, self.card.input.tile, self._cells, unit=unit)
+        return FeatureMap(cells, *cell_place(placed, cells.shape[:2], shape=span))
+
+    def _cells(self, fed: UInt8[np.ndarray, "n h w 3"]) -> Float32[np.ndarray, "n r s c"]:
+        raw = self.session.run(self.session.output(self.card.output.name).name, self._feeds(fed))
+        return self._reader.cells(raw, len(fed), fed.shape[1:3])
+
+    def _masks(self, part: Sequence[Placed]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        fed = np.stack([placed.fed for placed in part])
+        return read_masks(self.session, self.card.output, self._feeds(fed), len(part), self._reader)
+
+    def _embed(self, images: Sequence[UInt8[np.ndarray, "_ _ 3"]]) -> Float32[np.ndarray, "n c"]:
+        size, output = self._input.shape[0] or _BATCH, self.session.output(self.card.output.name).name
+        vectors = [np.zeros((0, self.dim), dtype=np.float32)]
+        for at in range(0, len(images), size):
+            fed = np.stack([place(image, self.card.input).fed for image in images[at : at + size]])
+            raw = self.session.run(output, self._feeds(fed))
+            if raw.ndim != 2 or len(raw) != len(fed) or raw.dtype.kind != "f":
+                raise self._reader.misfit(f"one vector an image ({len(fed)}, channels)", f"{raw.dtype} {raw.shape}")
+            vectors.append(self._reader.unit(raw))
+        return np.concatenate(vectors)
+
+    def _feeds(self, images: UInt8[np.ndarray, "n h w 3"]) -> dict[str, np.ndarray]:
+        fed = colour(images, self.card.input)
         if self.card.input.layout == "NCHW":
             fed = np.ascontiguousarray(fed.transpose(0, 3, 1, 2))
         if self._input.numpy is np.uint8:
             fed = np.clip(np.rint(fed), 0, 255)
-        return fed.astype(self._input.numpy or np.float32)
-
-    def _cells(self, raw: np.ndarray, count: int) -> Float32[np.ndarray, "n h w c"]:
-        """Check what came out and turn it into unit features or probabilities."""
-        kind, layout = self.card.output.kind, self.card.output.layout
-        if kind == "classes":
-            return self._one_hot(raw, count)
-        if raw.ndim != 4 or len(raw) != count or raw.dtype.kind != "f":
-            raise self._misfit(f"floats ({count}, ...) of 4 axes in layout {layout}", f"{raw.dtype} {raw.shape}")
-        cells = np.ascontiguousarray(raw.transpose(0, 2, 3, 1) if layout == "NCHW" else raw, dtype=np.float32)
-        if cells.shape[3] != self.dim:
-            raise self._misfit(f"{self.dim} channels, {self._channel_source()}", f"{cells.shape[3]} in {raw.shape}")
-        if kind == "features":
-            return self._unit(cells)
-        if kind == "logits":
-            cells = np.exp(cells - cells.max(axis=3, keepdims=True))
-            return cells / cells.sum(axis=3, keepdims=True)
-        off = float(np.abs(cells.sum(axis=3) - 1).max())
-        if off > _PROBABILITY_TOLERANCE or cells.min() < -_PROBABILITY_TOLERANCE:
-            raise self._misfit(
-                "probabilities that sum to 1", f"sums off by {off:.3g}, lowest {cells.min():.3g}", "is it kind: logits?"
-            )
-        return np.clip(cells, 0, 1)
-
-    def _unit(self, cells: Float32[np.ndarray, "n h w c"]) -> Float32[np.ndarray, "n h w c"]:
-        """Normalise each cell; one without any feature stays zero."""
-        lengths = np.linalg.norm(cells, axis=3, keepdims=True)
-        off = float(np.abs(lengths - 1).max())
-        if self.card.output.normalized and off > _NORM_TOLERANCE:
-            raise self._misfit("features of length 1", f"lengths off by {off:.3g}", "write normalized: false")
-        return cells / np.where(lengths > 0, lengths, 1)
-
-    def _one_hot(self, raw: np.ndarray, count: int) -> Float32[np.ndarray, "n h w c"]:
-        channel = {"NCHW": 1, "NHWC": 3}.get(self.card.output.layout)
-        numbers = raw
-        if channel is not None and raw.ndim == 4 and raw.shape[channel] == 1:
-            numbers = raw.squeeze(channel)
-        if numbers.ndim != 3 or len(numbers) != count or (numbers != np.rint(numbers)).any():
-            raise self._misfit(f"class numbers ({count}, height, width)", f"{raw.dtype} {raw.shape}")
-        if numbers.min() < 0 or numbers.max() >= self.dim:
-            raise self._misfit(f"classes 0..{self.dim - 1}, one a label", f"{numbers.min()}..{numbers.max()}")
-        return np.eye(self.dim, dtype=np.float32)[numbers.astype(np.intp)]
-
-    def _check_declared(self) -> None:
-        """Compare what the file declares with the card, before anything runs."""
-        card, port = self.card, self._input
-        if card.sha256 is not None and card.sha256 != sha256(self._session.path):
-            raise ModelError(
-                f"the card {card.name!r} is for another file than {self._session.path.name}",
-                expected=f"sha256 {card.sha256[:16]}...",
-                got=f"{sha256(self._session.path)[:16]}...",
-            )
-        if len(self._session.inputs) != 1:
-            raise self._misfit("one input, an image", "; ".join(map(str, self._session.inputs)))
-        if port.numpy not in (np.float32, np.float16, np.uint8) or len(port.shape) != 4:
-            raise self._misfit("images of 4 axes, float or uint8", str(port))
-        batch, *rest = port.shape
-        height, width, channels = rest if card.input.layout == "NHWC" else (*rest[1:], rest[0])
-        swapped = channels is None and rest[0 if card.input.layout == "NHWC" else 2] == 3
-        if channels not in (None, 3) or swapped:
-            raise self._misfit(f"3 colours in layout {card.input.layout}", str(port), "check input.layout")
-        if batch not in (None, 1):
-            raise self._misfit("a batch of 1 or of any size", str(port), "export it so")
-        wanted = card.input.size or (None, None)
-        for name, has, asked in (("height", height, wanted[0]), ("width", width, wanted[1])):
-            if has is not None and has != asked:
-                raise self._misfit(f"{name} {asked or 'free'} as in the card", str(port), "write input.size")
-        self._check_declared_output(self._output)
-
-    def _check_declared_output(self, port: Port) -> None:
-        kind, layout = self.card.output.kind, self.card.output.layout
-        if kind == "classes":
-            return
-        if port.shape and len(port.shape) != 4:
-            raise self._misfit(f"an output of 4 axes in layout {layout}", str(port))
-        channels = port.shape[1 if layout == "NCHW" else 3] if port.shape else None
-        if channels not in (None, self.dim):
-            raise self._misfit(
-                f"{self.dim} channels in layout {layout}, {self._channel_source()}",
-                f"{channels} in {port}",
-                "check output.layout and labels",
-            )
-
-    def _channel_source(self) -> str:
-        return "one a label" if self.contract == "logits" else "as many as the text model's vectors have"
-
-    def _misfit(self, expected: str, got: str, fix: str | None = None) -> ModelError:
-        return ModelError(f"{self._session.path.name} does not fit its card", expected=expected, got=got, fix=fix)
+        return {self._input.name: fed.astype(self._input.numpy or np.float32)}
 
 
-def prepare(image: UInt8[np.ndarray, "h w 3"], card: InputCard) -> Float32[np.ndarray, "h2 w2 3"]:
-    """Resize an RGB image and bring its colours to what a model wants."""
-    import cv2
+class _Proposals:
+    """Masks for crops, from a second model or from images; the cells of their MaskMaps have no vectors."""
 
-    height, width = card.size or _rounded(image.shape[:2], card.multiple_of or 1)
-    # the exact ones: OpenCV 5 cuts off fractions of grey levels in INTER_LINEAR; INTER_NEAREST is off by half a pixel
-    how = {"bilinear": cv2.INTER_LINEAR_EXACT, "area": cv2.INTER_AREA, "nearest": cv2.INTER_NEAREST_EXACT}
-    if image.shape[:2] != (height, width):
-        image = cv2.resize(image, (width, height), interpolation=how[card.interpolation])  # pyright: ignore
-    colors = image[:, :, ::-1] if card.color == "BGR" else image
-    low, high = card.range
-    gain = (high - low) / 255.0 / np.asarray(card.std)
-    shift = (low - np.asarray(card.mean)) / np.asarray(card.std)
-    return colors.astype(np.float32) * gain.astype(np.float32) + shift.astype(np.float32)
+    def __init__(self, model: OnnxEncoder | None, images: MaskFiles | None, files: tuple[Path, ...]) -> None:
+        self._model, self._images, self.files = model, images, files
+        self.given = model is not None or images is not None
+
+    @classmethod
+    def of(cls, card: CropCard | None, folder: Path, like: Session) -> "_Proposals":
+        """Open what the card names; nothing where it names no masks."""
+        if card is not None and card.masks_onnx is not None:
+            # runs where, and within the limits, that the image tower does
+            providers = [name for name in like.providers if name != CPU]
+            session = Session(folder / card.masks_onnx, providers=[*providers, CPU], limits=like.limits)
+            found, home = _card(None, session)
+            if found.contract != "masks":
+                raise ModelError(f"{card.masks_onnx} makes no masks", expected="contract masks", got=found.contract)
+            alone = _without_words(found)
+            return cls(OnnxEncoder(alone, session, None, folder=home), None, session.files)
+        if card is not None and card.mask_images is not None and card.images is not None:
+            return cls(None, MaskFiles(folder / card.mask_images, folder / card.images), ())
+        return cls(None, None, ())
+
+    def __call__(self, images: Sequence[UInt8[np.ndarray, "_ _ 3"]]) -> list[MaskMap]:
+        if self._model is not None:
+            return self._model.encode_masks(images)
+        assert self._images is not None, "only called where masks are given"
+        found = []
+        for image in images:
+            ids = self._images.ids(image)
+            scale = (ids.shape[1] / image.shape[1], ids.shape[0] / image.shape[0])
+            count = int(ids.max(initial=-1)) + 1
+            empty, sure = np.zeros((count, 0), np.float32), np.ones(count, np.float32)
+            found.append(MaskMap(ids, empty, sure, scale, (0.5 * scale[0] - 0.5, 0.5 * scale[1] - 0.5)))
+        return found
 
 
-def _rounded(size: Sequence[int], multiple: int) -> tuple[int, int]:
-    height, width = (max(1, round(n / multiple)) * multiple for n in size)
-    return height, width
+def _without_words(card: Card) -> Card:
+    """Return the card of a mask model without vectors and words."""
+    from msgspec import structs
+
+    return structs.replace(card, output=structs.replace(card.output, embeddings=None), text=None)
 
 
 def _fingerprint(card: Card, files: Sequence[Path]) -> str:

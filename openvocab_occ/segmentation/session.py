@@ -1,21 +1,27 @@
-"""Opening ONNX files of strangers: what a file refers to is looked at before anything of it runs."""
+"""Running ONNX files of strangers: inspected first, then bounded in time and in what they put out."""
 
-from collections.abc import Iterator, Mapping, Sequence
+import threading
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from openvocab_occ.errors import ConfigError, ModelError, UnsafeFileError
+from openvocab_occ.errors import ConfigError, ModelError
 from openvocab_occ.io.files import PathLike, existing
+from openvocab_occ.segmentation.card_files import METADATA_KEY
+from openvocab_occ.segmentation.inspection import Limits as Limits
+from openvocab_occ.segmentation.inspection import first_line
+from openvocab_occ.segmentation.inspection import inspect_model as inspect_model
 
 if TYPE_CHECKING:
-    import onnx
     import onnxruntime
 
-DOMAINS = frozenset({"", "ai.onnx", "ai.onnx.ml", "com.microsoft"})
-"""Operator sets that come with onnxruntime; others would need native code of the model's maker."""
+CPU = "CPUExecutionProvider"
+PROVIDERS = {"cpu": CPU, "cuda": "CUDAExecutionProvider", "tensorrt": "TensorrtExecutionProvider"}
+"""Short names; onnxruntime's own names are taken too."""
 _DTYPES = {
     "tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(double)": np.float64,
     "tensor(uint8)": np.uint8, "tensor(int32)": np.int32, "tensor(int64)": np.int64,
@@ -45,13 +51,22 @@ class Session:
     """A model file that was found harmless, ready to run."""
 
     def __init__(
-        self, path: PathLike, *, providers: Sequence[str] = ("CPUExecutionProvider",), threads: int | None = None
+        self,
+        path: PathLike,
+        *,
+        providers: Sequence[str] = (CPU,),
+        threads: int | None = None,
+        limits: Limits | None = None,
     ) -> None:
         self.path = existing(path, "ONNX model")
-        self.files = inspect_model(self.path)
+        self.limits = limits or Limits()
+        self.files = inspect_model(self.path, self.limits)
         self._session = _open(self.path, providers, threads)
+        self.providers: tuple[str, ...] = tuple(self._session.get_providers())
+        """What it runs on, best first."""
         self.inputs = tuple(_port(i) for i in self._session.get_inputs())
         self.outputs = tuple(_port(o) for o in self._session.get_outputs())
+        self.embedded_card: str | None = self._session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
 
     def input(self, name: str | None) -> Port:
         """Return the input of this name, or the only one."""
@@ -62,14 +77,42 @@ class Session:
         return _pick(self.outputs, name, "output", self.path)
 
     def run(self, output: str, feeds: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return one output as a finite array; ModelError if the model fails or puts out NaN."""
+        """Return one output as a finite array; ModelError if the model fails, takes too long, or puts out NaN."""
+        return self.run_many([output], feeds)[0]
+
+    def run_many(self, outputs: Sequence[str], feeds: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        """Return several outputs of one run, each checked as by `run`."""
+        import onnxruntime
+
+        options = onnxruntime.RunOptions()
+        late = threading.Timer(self.limits.seconds, setattr, (options, "terminate", True))
+        late.daemon = True
+        late.start()
         try:
-            (found,) = self._session.run([output], dict(feeds))
-        except _runtime_errors() as error:
+            found = self._session.run(list(outputs), dict(feeds), options)
+        except (*_runtime_errors(), MemoryError) as error:
+            if options.terminate:
+                raise ModelError(
+                    f"model {self.path.name} was stopped",
+                    expected=f"a run within {self.limits.seconds:g} s",
+                    got="no end",
+                    fix="is it meant for such large images?",
+                ) from error
             shapes = ", ".join(f"{name} {array.shape}" for name, array in feeds.items())
-            raise ModelError(f"model {self.path.name} failed on {shapes}", got=_first_line(error)) from error
+            raise ModelError(f"model {self.path.name} failed on {shapes}", got=first_line(error)) from error
+        finally:
+            late.cancel()
+        return [self._checked(name, value) for name, value in zip(outputs, found, strict=True)]
+
+    def _checked(self, output: str, found: Any) -> np.ndarray:
         if not isinstance(found, np.ndarray) or found.dtype.kind not in "fiub":
             raise ModelError(f"output {output} of {self.path.name} is no tensor of numbers", got=type(found).__name__)
+        if found.size > self.limits.elements:
+            raise ModelError(
+                f"output {output} of {self.path.name} is too large",
+                expected=f"at most {self.limits.elements:,} numbers",
+                got=f"{found.size:,}",
+            )
         if found.dtype.kind == "f" and not np.isfinite(found).all():
             bad = int(found.size - np.isfinite(found).sum())
             raise ModelError(
@@ -81,111 +124,47 @@ class Session:
         return found
 
 
-def inspect_model(path: Path) -> tuple[Path, ...]:
-    """Return the files of a model, itself first; nothing of it is run and no file it names is opened.
+def chosen_providers(asked: Sequence[str]) -> list[str]:
+    """Return onnxruntime's names of what was asked for and is there; warn where only the processor is left.
 
-    Raises:
-        ModelError: It is no ONNX file, or lacks a file of weights.
-        UnsafeFileError: It reaches outside its folder or through links, or needs operators that are foreign code.
+    Raises ConfigError for a name that onnxruntime does not know.
     """
-    import onnx
-    from google.protobuf.message import DecodeError
+    import onnxruntime
 
-    if not path.is_file():
-        raise ModelError(f"model {path} is not a file", expected="an .onnx file", got="a folder")
-    try:
-        model = onnx.load(str(path), load_external_data=False)
-    except (DecodeError, ValueError, OSError, UnicodeDecodeError) as error:
-        raise ModelError(f"model {path.name} is not ONNX", expected="an .onnx file", got=_first_line(error)) from error
-    if not model.graph.node:
-        raise ModelError(f"model {path.name} is not ONNX", expected="a graph of operators", got="an empty graph")
-    local = {(function.domain, function.name) for function in model.functions}
-    files = {path: None}
-    for node in _nodes(model):
-        if (node.domain not in DOMAINS and (node.domain, node.op_type) not in local) or node.op_type == "EPContext":
-            raise UnsafeFileError(
-                f"model {path.name} needs the operator {node.domain}.{node.op_type}",
-                expected="operators that come with onnxruntime",
-                fix="export it without custom operators",
-            )
-    for tensor in _tensors(model):
-        if tensor.external_data or tensor.data_location == onnx.TensorProto.EXTERNAL:
-            files[_weights(tensor, path)] = None
-    return tuple(files)
-
-
-def _weights(tensor: "onnx.TensorProto", path: Path) -> Path:
-    facts = {entry.key: entry.value for entry in tensor.external_data}
-    place = facts.get("location", "")
-    if not place or place != Path(place).name or place in (".", "..") or "\\" in place or ":" in place:
-        raise UnsafeFileError(
-            f"model {path.name} refers to a file outside its folder",
-            expected="plain names of files beside it",
-            got=repr(place),
+    known, there = onnxruntime.get_all_providers(), onnxruntime.get_available_providers()
+    names = [PROVIDERS.get(name.lower(), name) for name in asked]
+    if unknown := [name for name in names if name not in known]:
+        raise ConfigError(
+            f"onnxruntime has no {', '.join(unknown)}", expected=" or ".join([*PROVIDERS, *there]), got=list(asked)
         )
-    file = path.parent / place
-    if file.is_symlink():
-        raise UnsafeFileError(
-            f"model {path.name} has weights behind a link", expected="a plain file beside it", got=repr(place)
+    if missing := [name for name in names if name not in there]:
+        warnings.warn(
+            f"this onnxruntime has no {', '.join(missing)}; falling back to {CPU}. "
+            "The package onnxruntime-gpu, in place of onnxruntime, has CUDA and TensorRT.",
+            RuntimeWarning,
+            stacklevel=2,
         )
-    if not file.is_file():
-        raise ModelError(f"model {path.name} lacks its weights", expected=f"{place} beside it", got="no such file")
-    try:
-        end = int(facts.get("offset", 0)) + int(facts.get("length", 0))
-    except ValueError as error:
-        raise ModelError(f"model {path.name} has weights at no position", got=error) from error
-    if not 0 <= end <= file.stat().st_size:
-        raise ModelError(
-            f"weights {place} of {path.name} are cut off",
-            expected=f"at least {end} bytes",
-            got=f"{file.stat().st_size} bytes",
-        )
-    return file
-
-
-def _graphs(model: "onnx.ModelProto") -> Iterator[Any]:
-    """Yield the graph, the functions, and every graph inside an operator's attribute."""
-    waiting: list[Any] = [model.graph, *model.functions]
-    while waiting:
-        graph = waiting.pop()
-        yield graph
-        for node in graph.node:
-            for attribute in node.attribute:
-                waiting += [attribute.g] * attribute.HasField("g") + list(attribute.graphs)
-
-
-def _nodes(model: "onnx.ModelProto") -> Iterator["onnx.NodeProto"]:
-    for graph in _graphs(model):
-        yield from graph.node
-
-
-def _tensors(model: "onnx.ModelProto") -> Iterator["onnx.TensorProto"]:
-    for graph in _graphs(model):
-        yield from getattr(graph, "initializer", ())
-        sparse = list(getattr(graph, "sparse_initializer", ()))
-        for node in graph.node:
-            for attribute in node.attribute:
-                yield from [attribute.t] * attribute.HasField("t") + list(attribute.tensors)
-                sparse += [attribute.sparse_tensor] * attribute.HasField("sparse_tensor")
-                sparse += attribute.sparse_tensors
-        for tensor in sparse:
-            yield from (tensor.values, tensor.indices)
+    kept = [name for name in names if name in there]
+    return kept if CPU in kept else [*kept, CPU]
 
 
 def _open(path: Path, providers: Sequence[str], threads: int | None) -> "onnxruntime.InferenceSession":
     import onnxruntime
 
-    there = onnxruntime.get_available_providers()
-    if missing := [name for name in providers if name not in there]:
-        raise ConfigError(f"onnxruntime has no {', '.join(missing)}", expected=" or ".join(there))
+    if threads is not None and threads < 1:
+        raise ConfigError("threads is not usable", expected="at least 1", got=threads)
+    wanted = chosen_providers(providers)
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     if threads is not None:
         options.intra_op_num_threads = threads
     try:
-        return onnxruntime.InferenceSession(str(path), options, providers=list(providers))
-    except _runtime_errors() as error:
-        raise ModelError(f"onnxruntime cannot open {path.name}", got=_first_line(error)) from error
+        session = onnxruntime.InferenceSession(str(path), options, providers=wanted)
+    except (*_runtime_errors(), MemoryError) as error:
+        raise ModelError(f"onnxruntime cannot open {path.name}", got=first_line(error)) from error
+    if wanted[0] not in session.get_providers():  # its libraries could not be loaded
+        warnings.warn(f"{wanted[0]} did not start; {path.name} runs on {session.get_providers()[0]}", RuntimeWarning)
+    return session
 
 
 def _runtime_errors() -> tuple[type[Exception], ...]:
@@ -195,10 +174,6 @@ def _runtime_errors() -> tuple[type[Exception], ...]:
 
     kinds = [k for k in vars(state).values() if isinstance(k, type) and issubclass(k, Exception)]
     return (*kinds, RuntimeError, ValueError)
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().partition("\n")[0][:300]
 
 
 def _port(declared: Any) -> Port:

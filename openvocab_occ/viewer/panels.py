@@ -57,6 +57,8 @@ def answer_line(answer: Answer) -> str:
     if answer.hits:
         count = len(answer.hits)
         line = f"**{count} object{'s' * (count != 1)}**, {took}, threshold {answer.threshold:.2f}"
+        undecided = sum(hit.undecided for hit in answer.hits)
+        line += f"  \n{undecided} undecided: not all that was asked was observed" if undecided else ""
         return line + (f"  \nnot understood: {unknown}" if unknown else "")
     if answer.verdict == "unknown words":
         known = ", ".join(escape(word) for word in answer.known[:_KNOWN_SHOWN])

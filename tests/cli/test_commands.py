@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from openvocab_occ.cli import COMMANDS, main
-from openvocab_occ.segmentation.card import SHIPPED
-from openvocab_occ.segmentation.demo_models import demo_model
+from openvocab_occ.segmentation.card_files import SHIPPED
+from openvocab_occ.segmentation.demo_models import street_model
 
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A saved map of the synthetic street."""
     path = tmp_path_factory.mktemp("maps") / "street.ovmap"
-    assert main(["map", "city", "any", "--encoder", str(demo_model()), "--out", str(path), "--frames", "3"]) == 0
+    assert main(["map", "street", "any", "--encoder", str(street_model()), "--out", str(path), "--frames", "3"]) == 0
     return path
 
 
@@ -64,8 +64,8 @@ def test_map_find_export_print_json(street, tmp_path, capsys):
     report = printed(capsys)
     assert "view.json" in report["files"]
     assert report["answer"]["hits"] == answer["hits"]
-    assert main(["map", "city", "any", "--encoder", str(demo_model()), "--out", str(tmp_path / "a.ovmap"), "--frames",
-                 "1", "--json"]) == 0  # fmt: skip
+    out = ["--out", str(tmp_path / "a.ovmap"), "--frames", "1", "--json"]
+    assert main(["map", "street", "any", "--encoder", str(street_model()), *out]) == 0
     report = printed(capsys)
     assert report["frames"] == 1
     assert report["synthetic"] is True
@@ -84,8 +84,8 @@ def test_own_occupancy_joins_from_the_command_line(keyframe, tmp_path, capsys):
     labels[130, 60:140] = 15
     np.savez(tmp_path / "0.npz", semantics=labels)
     assert main(["map", "nuscenes-infos", str(keyframe / "info.json"), "--occupancy", str(tmp_path / "{index}.npz"),
-                 "--encoder", str(demo_model()), "--out", str(tmp_path / "a.ovmap"), "--json"]) == 0  # fmt: skip
-    assert 0 < printed(capsys)["voxels"] <= 80 * 16
+                 "--encoder", str(street_model()), "--out", str(tmp_path / "a.ovmap"), "--json"]) == 0  # fmt: skip
+    assert 0 < printed(capsys)["voxels"] <= 80 * 16 * 1.3  # the wall is turned against the map
 
 
 class TestBadInput:
@@ -100,13 +100,13 @@ class TestBadInput:
 
     def test_missing_model(self, tmp_path, capsys):
         message = refused(
-            capsys, "map", "city", "any", "--encoder", tmp_path / "no.onnx", "--out", tmp_path / "a.ovmap"
+            capsys, "map", "street", "any", "--encoder", tmp_path / "no.onnx", "--out", tmp_path / "a.ovmap"
         )
         assert "no.onnx" in message
         assert not list(tmp_path.iterdir())
 
     def test_unknown_kind(self, tmp_path, capsys):
-        message = refused(capsys, "map", "kitty", tmp_path, "--encoder", demo_model(), "--out", tmp_path / "a.ovmap")
+        message = refused(capsys, "map", "kitty", tmp_path, "--encoder", street_model(), "--out", tmp_path / "a.ovmap")
         assert "nuscenes-infos" in message
 
     def test_empty_question(self, street, capsys):
@@ -115,14 +115,16 @@ class TestBadInput:
     def test_output_that_is_not_ours(self, tmp_path, capsys):
         (tmp_path / "a.ovmap").mkdir()
         (tmp_path / "a.ovmap" / "holiday.jpg").write_bytes(b"x")
-        message = refused(capsys, "map", "city", "any", "--encoder", demo_model(), "--frames", "1", "--out",
+        message = refused(capsys, "map", "street", "any", "--encoder", street_model(), "--frames", "1", "--out",
                           tmp_path / "a.ovmap")  # fmt: skip
         assert "not ours" in message
         assert (tmp_path / "a.ovmap" / "holiday.jpg").read_bytes() == b"x"
 
     def test_output_that_cannot_be_written_is_said_before_the_work(self, tmp_path, capsys):
         (tmp_path / "file").touch()
-        message = refused(capsys, "map", "city", "any", "--encoder", "no.onnx", "--out", tmp_path / "file" / "a.ovmap")
+        message = refused(
+            capsys, "map", "street", "any", "--encoder", "no.onnx", "--out", tmp_path / "file" / "a.ovmap"
+        )
         assert "cannot be written" in message
 
     @pytest.mark.data
@@ -131,7 +133,7 @@ class TestBadInput:
         card = tmp_path / "wrong.card.yaml"
         shipped = next(SHIPPED.glob("deeplab*.card.yaml")).read_text()
         card.write_text(shipped.replace("bus, car, cat", "bus, cat").replace("- car\n", ""))
-        message = refused(capsys, "map", "city", "any", "--encoder", model, "--card", card, "--out", tmp_path / "a")
+        message = refused(capsys, "map", "street", "any", "--encoder", model, "--card", card, "--out", tmp_path / "a")
         assert "20" in message
         assert "21" in message
 
@@ -139,7 +141,7 @@ class TestBadInput:
     def test_missing_sweep(self, keyframe, tmp_path, capsys):
         for file in [keyframe / "info.json", *keyframe.glob("*.jpg")]:
             shutil.copy(file, tmp_path / file.name)
-        message = refused(capsys, "map", "nuscenes-infos", tmp_path / "info.json", "--encoder", demo_model(), "--out",
+        message = refused(capsys, "map", "nuscenes-infos", tmp_path / "info.json", "--encoder", street_model(), "--out",
                           tmp_path / "a.ovmap")  # fmt: skip
         assert ".pcd.bin" in message
         assert not (tmp_path / "a.ovmap").exists()

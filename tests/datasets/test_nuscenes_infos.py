@@ -178,7 +178,5 @@ def test_scenes_and_cameras_by_name(write):
         load_sequence("nuscenes-infos", folder, cameras=["CAM_TOP"])[0]
     with pytest.raises(ConfigError, match="nuscenes-infos has no option 'fast': expected cameras"):
         load_sequence("nuscenes-infos", folder, fast=True)
-    with pytest.raises(
-        ConfigError, match="kind of sequence is not known: expected city or nuscenes-infos or street, got 'kitty'"
-    ):
+    with pytest.raises(ConfigError, match=r"kind of sequence is not known: expected city or .*, got 'kitty'"):
         load_sequence("kitty", folder)

@@ -159,7 +159,7 @@ def test_bad_options():
     with pytest.raises(ConfigError, match=r"occupancy_frame is not known: expected lidar_ego or .*got 'ego'"):
         load_sequence("street", occupancy="{token}.npz", occupancy_frame="ego")
     with pytest.raises(
-        ConfigError, match="has no pose of the grid frame 'cam_front_left_ego': expected lidar_ego or lidar"
+        ConfigError, match="has no pose of the grid frame 'cam_front_left_ego': expected lidar_ego or world or lidar"
     ):
         join_occupancy(drive(), lambda f: np.zeros(1), grid=GridFormat(frame="cam_front_left_ego"))[0]
     with pytest.raises(ConfigError, match="which class is free"):

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from openvocab_occ._jit import limit_threads
 from openvocab_occ.depth import render_depth
-from openvocab_occ.depth.pixel_rays import PixelRays
 from openvocab_occ.depth.raster import MIN_CLEARANCE, can_raster, clearance, raster
 from openvocab_occ.geometry import Camera, GridSpec, look_at, pose, transform
 from openvocab_occ.occupancy import GEOMETRY_CLASSES, OccupancyGrid, read_occ3d
+from openvocab_occ.occupancy.pixel_rays import PixelRays
 from openvocab_occ.occupancy.rays import trace_lattice
 
 ROLL = pose(wxyz=[np.cos(0.3), 0, 0, np.sin(0.3)])

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from openvocab_occ._jit import limit_threads
 from openvocab_occ.depth import render_depth
@@ -11,6 +13,7 @@ from openvocab_occ.errors import ConfigError, PoseError
 from openvocab_occ.geometry import Camera, GridSpec, look_at, pose
 from openvocab_occ.occupancy import GEOMETRY_CLASSES, OccupancyGrid, cast_rays, read_occ3d
 from openvocab_occ.occupancy._rays_reference import first_hit
+from openvocab_occ.occupancy.pixel_rays import PixelRays
 from openvocab_occ.occupancy.rays import lattice_rays
 
 K = np.array([[14.0, 0, 7.5], [0, 13.0, 5.0], [0, 0, 1]])
@@ -237,3 +240,44 @@ def test_on_real_labels_samples_follow_the_exact_depth(data):
     assert late.min() > -1e-4
     assert np.quantile(late, 0.95) <= 0.1 + 1e-4
     np.testing.assert_array_equal(grid.occupied.ravel()[exact.voxel[seen]], True)
+
+
+@pytest.mark.parametrize("height", [1.5, 1.513, 1.4])
+@pytest.mark.parametrize("step", [0.1, 0.25])
+@pytest.mark.data
+def test_on_real_labels_sampling_without_samples_is_sampling(data, height, step):
+    """On planes of the lattice (1.4 m up) and off them, every pixel is that of plain sampling."""
+    grid = read_occ3d(data / "occ3d" / "labels.npz")
+    K = np.array([[63.3, 0, 40.0], [0, 63.3, 24.0], [0, 0, 1]])
+    for target in ([20, 0.0, height], [-7, 12, height - 1]):
+        camera = Camera(K, 80, 45, look_at([1.7, 0.0, height], target))
+        view = PixelRays.of(camera, grid)
+        image = render_depth(grid, camera, step=step)
+        count = num_samples(100.0, step)
+        pixels = np.arange(0, 80 * 45, 7)
+        wanted = [first_sample(view.origin, d, grid.occupied, step, count) for d in view.directions(pixels)]
+        np.testing.assert_array_equal(image.voxel.ravel()[pixels], [w[1] for w in wanted])
+        depth = np.nan_to_num(np.array([w[0] for w in wanted]), nan=100.0).astype(np.float32)
+        np.testing.assert_array_equal(image.depth.ravel()[pixels], depth)
+
+
+@settings(max_examples=100)
+@given(
+    seed=st.integers(0, 1000),
+    place=st.tuples(*[st.one_of(st.integers(-2, 7).map(float), st.floats(-3, 8, width=16))] * 3),
+    wxyz=st.tuples(*[st.sampled_from([-1.0, 0.0, 0.5, 1.0, 0.3])] * 4).filter(any),
+    step=st.sampled_from([0.1, 0.5, 0.3, 1.0, 7.0]),
+    max_depth=st.sampled_from([0.5, 1.0, 3.0, 20.0]),
+)
+def test_so_it_is_for_whatever_hypothesis_thinks_of(seed, place, wxyz, step, max_depth):
+    random = np.random.default_rng(seed)
+    labels = (random.random(tuple(random.integers(1, 6, 3))) > 0.3).astype(np.uint8)
+    spec = GridSpec((0.0, 0.0, 0.0), 1.0, labels.shape)
+    grid = OccupancyGrid(labels, spec, free_label=1, class_names=GEOMETRY_CLASSES)
+    camera = Camera(np.array([[4.0, 0, 3.0], [0, 4, 3], [0, 0, 1]]), 7, 7, pose(place, wxyz))
+    view, image = PixelRays.of(camera, grid), render_depth(grid, camera, max_depth=max_depth, step=step)
+    count = num_samples(max_depth, step)
+    for pixel, direction in enumerate(view.directions(np.arange(49))):
+        depth, voxel = first_sample(view.origin, direction, grid.occupied, step, count)
+        assert image.voxel.flat[pixel] == voxel
+        assert image.depth.flat[pixel] == np.float32(max_depth if voxel < 0 else depth)

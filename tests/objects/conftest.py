@@ -1,5 +1,8 @@
 """Small maps of both contracts."""
 
+import sys
+from pathlib import Path
+
 import jaxtyping
 import numpy as np
 import pytest
@@ -7,6 +10,8 @@ import pytest
 from openvocab_occ.geometry import pose
 from openvocab_occ.mapping import Lifted, VoxelMap
 from openvocab_occ.objects import EncoderInfo, KeyFrame, NamedCamera, Provenance, SceneMap, group_objects
+
+sys.path.append(str(Path(__file__).parent))  # for block_frames
 
 
 @pytest.fixture

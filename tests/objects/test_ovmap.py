@@ -31,7 +31,7 @@ def rewrite(path, name, table):
 
 @pytest.fixture
 def saved(scene, tmp_path):
-    return scene.save(tmp_path / "street.ovmap")
+    return scene.save(tmp_path / "street.ovmap", max_cosine_error=0.0)
 
 
 def test_a_map_comes_back_as_it_was(scene, saved):
@@ -41,7 +41,7 @@ def test_a_map_comes_back_as_it_was(scene, saved):
     for name in ("labels", "count", "first_seen", "last_seen", "weight", "colors", "centers"):
         np.testing.assert_array_equal(getattr(back.voxels, name), getattr(scene.voxels, name))
     np.testing.assert_allclose(back.voxels.features, scene.voxels.features, atol=5e-4)
-    np.testing.assert_allclose(back.voxels.agreement, scene.voxels.agreement, rtol=1e-5)
+    np.testing.assert_allclose(back.voxels.agreement, scene.voxels.agreement, rtol=1e-3)
     for a, b in zip(back.objects.nodes, scene.objects.nodes, strict=True):
         assert (a.id, a.label, a.score, a.state, a.level, a.parent, a.children) == (
             b.id, b.label, b.score, b.state, b.level, b.parent, b.children,
@@ -70,20 +70,23 @@ def test_a_map_comes_back_as_it_was(scene, saved):
 def test_saving_again_adds_no_drift(scene, saved, tmp_path):
     path = saved
     for i in range(5):
-        path = SceneMap.open(path).save(tmp_path / f"copy{i}.ovmap")
+        path = SceneMap.open(path).save(tmp_path / f"copy{i}.ovmap", max_cosine_error=0.0)
     for name in ("objects.parquet", "frames.parquet"):
         assert sha256(path / name) == sha256(saved / name)
     np.testing.assert_allclose(SceneMap.open(path).voxels.features, scene.voxels.features, atol=1e-3)
-    scene.save(path)  # over another map
+    scene.save(path, max_cosine_error=0.0)  # over another map
     assert sha256(path / "voxels.parquet") == sha256(saved / "voxels.parquet")
 
 
 def test_the_manifest_states_what_rounding_cost(scene, saved):
     said = json.loads((saved / "manifest.json").read_text())
-    stored = scene.voxels.features.astype(np.float16).astype(np.float32)
-    assert said["features"]["worst_absolute_error"] == pytest.approx(np.abs(stored - scene.voxels.features).max())
-    assert 0.999 < said["features"]["worst_cosine"] <= 1
-    assert said["counts"] == {"voxels": 48, "features": 48, "objects": 4, "frames": 2}
+    stored = scene.voxels.features.astype(np.float16).astype(np.float64)
+    exact = scene.voxels.features.astype(np.float64)
+    cosine = (stored * exact).sum(1) / np.linalg.norm(stored, axis=1) / np.linalg.norm(exact, axis=1)
+    assert said["features"]["worst_cosine_error"] == pytest.approx(1 - cosine.min())
+    assert said["counts"] == {
+        "voxels": 48, "features": 48, "space": 0, "objects": 4, "dynamic": 0, "frames": 2,
+    }  # fmt: skip
     assert said["provenance"]["synthetic"] is True
 
 
@@ -134,22 +137,22 @@ def test_features_that_are_no_numbers_are_told(saved):
     vectors = pa.FixedSizeListArray.from_arrays(pa.array(flat), 3)
     rewrite(saved, "features.parquet", pa.table({"feature": vectors}))
     with pytest.raises(MapError, match=r"features of the map are not usable.*1 of 48 with NaN"):
-        SceneMap.open(saved)
+        _ = SceneMap.open(saved).voxels.features
 
 
 def test_files_that_contradict_each_other_are_told(saved):
     features = pq.read_table(saved / "features.parquet")
     rewrite(saved, "features.parquet", features.slice(0, 10))
     with pytest.raises(MapError, match=r"point to features that are not there: expected 0\.\.9, got 47"):
-        SceneMap.open(saved)
+        _ = SceneMap.open(saved).voxels.features
     rewrite(saved, "features.parquet", features)
     voxels = pq.read_table(saved / "voxels.parquet")
     rewrite(saved, "voxels.parquet", voxels.slice(0, 40))
     with pytest.raises(MapError, match="holds voxels that are not there"):
         SceneMap.open(saved)
     rewrite(saved, "voxels.parquet", voxels.drop_columns(["weight"]))
-    with pytest.raises(MapError, match="contradicts itself: got KeyError: 'weight'"):
-        SceneMap.open(saved)
+    with pytest.raises(MapError, match="contradicts itself: expected a column weight, got none"):
+        _ = SceneMap.open(saved).voxels.weight
     rewrite(saved, "voxels.parquet", pa.concat_tables([voxels.slice(0, 47), voxels.slice(0, 1)]))
     with pytest.raises(MapError, match="voxel keys repeat"):
         SceneMap.open(saved)

@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from openvocab_occ._jit import limit_threads
 from openvocab_occ.errors import ConfigError, DataError, ShapeError
 from openvocab_occ.geometry import GridSpec, pose, transform
-from openvocab_occ.occupancy import GEOMETRY_CLASSES, OccupancyGrid, cast_rays
+from openvocab_occ.occupancy import GEOMETRY_CLASSES, OccupancyGrid, cast_rays, rays
 from openvocab_occ.occupancy._rays_reference import first_hit
 from openvocab_occ.occupancy.rays import lattice_rays, trace
 
@@ -87,6 +87,21 @@ def test_the_walk_agrees_with_cutting_every_voxel(family, density, rng):
         for t_max in (3.0, np.inf):
             hits += assert_same_as_reference(grid_of(occupied), origins, directions, t_max)
     assert (hits > 0) == (density > 0)  # the families do reach the grid
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("density", [0.0, 0.002, 0.1, 1.0])
+def test_leaps_over_empty_blocks_change_nothing(family, density, rng, monkeypatch):
+    for shape in [(40, 30, 20), (17, 1, 9), (1, 1, 1)]:
+        grid = grid_of(rng.random(shape) < density)
+        origins, directions = family(rng, 2000, shape)
+        for t_max in (3.0, np.inf):
+            monkeypatch.setattr(rays, "LARGE", 1 << 40)
+            walked = trace(grid, origins, directions, t_max)
+            monkeypatch.setattr(rays, "LARGE", 0)
+            leapt = trace(grid, origins, directions, t_max)
+            for one, other in zip(walked, leapt, strict=True):
+                np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize("family", FAMILIES)

@@ -6,7 +6,8 @@ import pytest
 import yaml
 
 from openvocab_occ.errors import CardError, NotFoundError
-from openvocab_occ.segmentation.card import SHIPPED, Card, read_card
+from openvocab_occ.segmentation.card import Card
+from openvocab_occ.segmentation.card_files import SHIPPED, read_card
 
 TEXT = {"onnx": "t.onnx", "tokenizer": "t.json", "context_length": 8, "pad_id": 0}
 
@@ -25,7 +26,7 @@ def test_yaml_and_json_read_alike(tiny, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"nome": "x"}, "has the unknown key 'nome': expected one of schema, name, contract"),
+        ({"nome": "x"}, "has the unknown key 'nome': expected one of schema, name, labels"),
         ({"input__colour": "RGB"}, "has the unknown key 'input.colour': expected one of layout, color, range"),
         ({"contract": "dense", "text": {**TEXT, "inputs": {"id": "x"}}}, "unknown key 'text.inputs.id'"),
         ({"name": None}, "lacks the key 'name': expected str"),
@@ -33,7 +34,18 @@ def test_yaml_and_json_read_alike(tiny, tmp_path):
         ({"input__layout": None}, "lacks the key 'input.layout': expected NCHW or NHWC"),
         ({"schema": 2}, "wrong value at 'schema': expected 1, got 2"),
         ({"input__color": "rgb"}, "wrong value at 'input.color': expected RGB or BGR, got 'rgb'"),
-        ({"input__resize": "letterbox"}, "wrong value at 'input.resize': expected squash, got 'letterbox'"),
+        ({"input__resize": "crop"}, "wrong value at 'input.resize': expected squash or letterbox or pad, got 'crop'"),
+        ({"input__resize": "letterbox"}, "letterbox needs `size`; with `multiple_of` write pad"),
+        ({"input__tile": {"size": [8, 8], "overlap": 5}}, "at most half a tile"),
+        ({"input__tile": {"size": [8, 9]}, "input__multiple_of": 2}, "its size is a multiple of that"),
+        ({"output__prefix_tokens": -1}, "wrong value at 'output.prefix_tokens'"),
+        ({"score": {"kind": "sigmoid"}}, "sigmoid needs `score.scale` above 0"),
+        ({"score": {"kind": "relevancy", "scale": 10}}, "`score.negatives` are for kind relevancy, which needs some"),
+        ({"prompts": {"templates": ["a photo"]}}, "holds {} once"),
+        ({"input__range": "CONFIRM: [0, 1] or [0, 255]?"}, "is a draft: input.range must be confirmed"),
+        ({"contract": "tokens", "output": {"layout": "NTC", "kind": "features"}, "labels": None}, "`output.patch`"),
+        ({"crops": {"windows": [2.0]}}, "at most 1"),
+        ({"contract": "prompted"}, "expected dense or tokens or masks or crops or logits, got 'prompted'"),
         ({"input__range": [0, "one"]}, r"wrong value at 'input.range\[1\]': expected float, got str"),
         ({"input__mean": [1, 2]}, "wrong value at 'input.mean': .*length 3, got 2"),
         ({"labels": "road"}, "wrong value at 'labels': expected array, got str"),
@@ -42,7 +54,10 @@ def test_yaml_and_json_read_alike(tiny, tmp_path):
         ({"input__std": [1, 0, 1]}, "`input.std` above 0"),
         ({"input__mean": [float("nan"), 0, 0]}, "all of them finite"),
         ({"input__range": [1, 0]}, "low < high"),
-        ({"output__kind": "features"}, "features for contract dense"),
+        (
+            {"output__kind": "features"},
+            "logits or probabilities or classes for contract logits",
+        ),
         ({"output__layout": "NHW"}, "NHW is for kind `classes`"),
         ({"labels": ["a", "a"]}, "at least two, each once"),
         ({"contract": "dense", "output__kind": "features", "labels": None}, "contract dense needs `text`"),

@@ -14,8 +14,9 @@ from openvocab_occ.datasets.street import PALETTE
 from openvocab_occ.errors import CardError, ConfigError, ModelError, NotFoundError, UnsafeFileError
 from openvocab_occ.segmentation import FeatureMap, PixelEncoder
 from openvocab_occ.segmentation.card import InputCard
-from openvocab_occ.segmentation.demo_models import demo_model
+from openvocab_occ.segmentation.demo_models import street_model
 from openvocab_occ.segmentation.onnx import load_encoder, prepare
+from openvocab_occ.segmentation.session import PROVIDERS
 
 FLOAT = TensorProto.FLOAT
 
@@ -306,14 +307,30 @@ def test_foreign_operators_are_refused(tiny, tmp_path, domain, kind):
         load_encoder(model)
 
 
+def test_providers_that_are_not_there_fall_back_with_a_warning(tiny, tmp_path, image):
+    import onnxruntime
+
+    missing = [short for short, name in PROVIDERS.items() if name not in onnxruntime.get_available_providers()]
+    if not missing:
+        pytest.skip("this onnxruntime has every provider")
+    model = tiny.identity(tmp_path / "m.onnx")
+    tiny.write_card(model)
+    with pytest.warns(RuntimeWarning, match="falling back to CPUExecutionProvider"):
+        encoder = load_encoder(model, providers=(*missing, "cpu"))
+    assert encoder.session.providers == ("CPUExecutionProvider",)
+    np.testing.assert_array_equal(encoder.encode([image])[0].cells, load_encoder(model).encode([image])[0].cells)
+    with pytest.raises(ConfigError, match="threads is not usable: expected at least 1, got 0"):
+        load_encoder(model, threads=0)
+
+
 def test_unknown_provider(tiny, tmp_path):
     model = tiny.identity(tmp_path / "m.onnx")
     with pytest.raises(ConfigError, match=r"onnxruntime has no WarpExecutionProvider: expected .*CPUExecutionProvider"):
         load_encoder(model, providers=("WarpExecutionProvider",))
 
 
-def test_demo_model_knows_the_street():
-    encoder = load_encoder(demo_model())
+def test_street_model_knows_the_street():
+    encoder = load_encoder(street_model())
     assert encoder.labels[-1] == "sky"
     assert len(encoder.labels) == len(PALETTE) == encoder.dim
     flat = [np.full((8, 8, 3), color, np.uint8) for color in PALETTE.values()]
@@ -355,5 +372,5 @@ def test_voc_model_sees_the_lorry(data):
 
 
 def test_sha256_of_the_demo_card_is_the_files():
-    digest = hashlib.sha256(demo_model().read_bytes()).hexdigest()
-    assert digest in demo_model().with_suffix(".card.yaml").read_text()
+    digest = hashlib.sha256(street_model().read_bytes()).hexdigest()
+    assert digest in street_model().with_suffix(".card.yaml").read_text()

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
-from openvocab_occ.datasets.city.labels import Labels, camera_directions, lidar_directions_world, observed
+from openvocab_occ.datasets.city.labels import Labels, lidar_directions_world, observed
 from openvocab_occ.datasets.city.movers import Mover
 from openvocab_occ.datasets.city.sensors import LIDAR_NOISE, LIDAR_RANGE, PERIOD, T_EGO_LIDAR, lidar_directions
 from openvocab_occ.datasets.city.surfaces import Material
@@ -15,9 +15,11 @@ from openvocab_occ.datasets.city.voxels import voxelise
 from openvocab_occ.datasets.frame import Frame, View
 from openvocab_occ.geometry import invert, transform
 from openvocab_occ.occupancy import OCC3D_FREE, OCC3D_SPEC, OccupancyGrid
+from openvocab_occ.occupancy.visibility import visibility_mask
 
 _LIDAR_SPAN = (-6, -3, 0, 3, 6)  # keyframes whose LiDAR poses count for mask_lidar
 _BEAM_STRIDE = 2  # of the columns of those sweeps
+_PIXEL_STRIDE = 3  # of rays for mask_camera: 0.2 m apart at 40 m
 BOX_RANGE = 60.0
 """Metres from the ego within which things get boxes."""
 _MOVED = 0.5  # m that tell moving from standing still
@@ -163,9 +165,8 @@ def labels(drive: Traversal, index: int, instant: Instant | None = None, *, mask
     flat = OCC3D_SPEC.flat(OCC3D_SPEC.index(returns))
     mask_lidar.reshape(-1)[flat[flat >= 0]] = True
     cameras = [camera for _, camera, _ in drive.cameras(index)]
-    eyes = np.array([camera.position for camera in cameras])
-    mask_camera = observed(whole, eyes, [camera_directions(camera) for camera in cameras]) & mask_lidar
     grid = OccupancyGrid(voxels.semantics, OCC3D_SPEC, T_world_ego, OCC3D_FREE, known=mask_lidar)
+    mask_camera = visibility_mask(grid, cameras, mode="pixel", stride=_PIXEL_STRIDE)
     return Labels(grid, voxels.instances, mask_lidar, mask_camera)
 
 

@@ -3,19 +3,23 @@
 The mean colour x of each 4x4 block is scored for a class of colour c by -s |x - c|^2, less the term in |x|^2 that all
 classes share: s (2 c x - |c|^2), which is a 1x1 convolution. Colours come from the street's own palette.
 
-    python models/demo/make.py
+    python models/street/make.py
 """
 
 from pathlib import Path
 
 import numpy as np
 import onnx
-import yaml
+from msgspec import structs
 from onnx import TensorProto, helper, numpy_helper
 
 from openvocab_occ.datasets.street import PALETTE
 from openvocab_occ.io.files import sha256
 from openvocab_occ.occupancy import OCC3D_CLASSES, OCC3D_FREE
+from openvocab_occ.segmentation.card import Card, InputCard, OutputCard
+from openvocab_occ.segmentation.card_files import write_card
+from openvocab_occ.segmentation.onnx import load_encoder
+from openvocab_occ.segmentation.selftest import record
 
 STRIDE = 4
 SHARPNESS = 60.0  # 1 / (2 sigma^2) of colours in [0, 1]: sigma about 0.09, the spread that light and haze give
@@ -49,19 +53,18 @@ def main(folder: Path = Path(__file__).parent) -> None:
     """Write the model and its card."""
     path = folder / "segmenter.onnx"
     onnx.save(make(), str(path))
-    card = {
-        "schema": 1,
-        "name": "synthetic street segmenter",
-        "contract": "logits",
-        "input": {"name": "image", "layout": "NCHW", "color": "RGB", "range": [0, 1], "multiple_of": STRIDE},
-        "output": {"name": "logits", "layout": "NCHW", "kind": "logits"},
-        "labels": ["sky" if label == OCC3D_FREE else OCC3D_CLASSES[label] for label in PALETTE],
-        "license": "Apache-2.0",
-        "source": "synthetic: made by models/demo/make.py from the palette of the street; knows no real image",
-        "sha256": sha256(path),
-    }
-    text = "# Made by models/demo/make.py. Synthetic: it tells the flat colours of the made-up street apart.\n"
-    (folder / "segmenter.card.yaml").write_text(text + yaml.safe_dump(card, sort_keys=False, default_flow_style=None))
+    card = Card(
+        schema=1, name="synthetic street segmenter", contract="logits",
+        input=InputCard(name="image", layout="NCHW", color="RGB", range=(0.0, 1.0), multiple_of=STRIDE),
+        output=OutputCard(name="logits", layout="NCHW", kind="logits", stride=float(STRIDE)),
+        labels=tuple("sky" if label == OCC3D_FREE else OCC3D_CLASSES[label] for label in PALETTE),
+        license="Apache-2.0", sha256=sha256(path),
+        source="synthetic: made by models/street/make.py from the palette of the street; knows no real image",
+    )  # fmt: skip
+    comment = "Made by models/street/make.py. Synthetic: it tells the flat colours of the made-up street apart."
+    write_card(card, path.with_suffix(".card.yaml"), comment=comment)
+    card = structs.replace(card, selftest=record(load_encoder(path)))
+    write_card(card, path.with_suffix(".card.yaml"), comment=comment)
 
 
 if __name__ == "__main__":

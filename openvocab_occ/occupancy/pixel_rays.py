@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from openvocab_occ.geometry import Camera
-from openvocab_occ.occupancy import OccupancyGrid
+from openvocab_occ.occupancy.grid import OccupancyGrid
 from openvocab_occ.occupancy.rays import lattice_rays
 
 

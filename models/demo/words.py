@@ -1,0 +1,56 @@
+"""Word vectors made by text.py, and texts as their means: the text side before its linear head."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import yaml
+
+HERE = Path(__file__).parent
+_ALIKE = 0.45  # cosine to a word of the lexicon, above which a random word may mean the same
+_COMMON = 14000  # words, by rank, that random ones are drawn from
+
+
+@dataclass(frozen=True, eq=False)
+class Words:
+    """A table of words."""
+
+    words: list[str]
+    vectors: torch.Tensor
+    """Reduced and weighted; zero for silent words and for the unknown one, which is the first."""
+    others: np.ndarray
+    """Rows of words that mean nothing in the lexicon."""
+
+    @property
+    def dim(self) -> int:
+        """Numbers a word."""
+        return self.vectors.shape[1]
+
+    @classmethod
+    def read(cls) -> "Words":
+        """Read what text.py wrote."""
+        with np.load(HERE / "cache" / "words.npz") as stored:
+            words, full, reduced = list(map(str, stored["words"])), stored["full"].astype("f4"), stored["reduced"]
+        lexicon = yaml.safe_load((HERE / "lexicon.yaml").read_text())
+        entries = (entry for part in ("things", "parts", "materials") for entry in lexicon[part].values())
+        meant = {w for entry in entries for phrase in entry["words"] for w in phrase.split()} | set(lexicon["colors"])
+        number = {word: row for row, word in enumerate(words)}
+        known = full[[number[word] for word in meant if word in number]]
+        alike = (full @ known.T).max(axis=1) / np.linalg.norm(full, axis=1)
+        spoken = np.abs(reduced).sum(axis=1) > 0
+        others = np.flatnonzero(spoken & (alike < _ALIKE) & (np.arange(len(words)) < _COMMON))
+        return cls(words, torch.from_numpy(reduced), others)
+
+    def mean(self, texts: list[str]) -> torch.Tensor:
+        """Return the mean vector of each text."""
+        number = {word: row for row, word in enumerate(self.words)}
+        rows = [[number.get(word, 0) for word in re.findall(r"[a-z]+", text.lower())] for text in texts]
+        return torch.stack([self.vectors[row].sum(dim=0) / max(1, len(row)) for row in rows])
+
+    def strangers(self, random: np.random.Generator, count: int) -> torch.Tensor:
+        """Return random words and pairs of words that mean nothing in the lexicon."""
+        pairs = self.vectors[random.choice(self.others, (count, 2))]
+        alone = torch.from_numpy(random.random(count) < 0.7)
+        return torch.where(alone[:, None], pairs[:, 0], pairs.mean(dim=1))
