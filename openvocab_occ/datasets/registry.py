@@ -49,8 +49,8 @@ def load_sequence(
             `nuscenes` (the official tables, Occ3D's `gts/` beside them), `nuscenes-infos` (mmdetection3d v1.1 info
             files), `kitti` (odometry and SemanticKITTI), `rgbd` (7-Scenes, 3DMatch, TUM, ScanNet exports), `nerfstudio`
             (transforms.json), `colmap`, `rosbag` (ROS 1, ROS 2, MCAP), `recording` (our own folder, docs/recording.md),
-            `city` (a made-up town; options `seed`, `route`, `traversal`, `condition`, `frames`, `size`), `street` (a
-            small made-up street; options `seed`, `frames`). The readers' own docs tell their options.
+            `city` (a made-up town, docs/city.md) or `street` (a small made-up street; options `seed`, `frames`). The
+            readers' own docs tell their options.
         root: File or folder of the drive.
         scene: Which drive, where the root holds several.
         occupancy: Your own predictions: a file name with {token}, {index}, {scene} or {timestamp}, relative to the

@@ -73,29 +73,39 @@ def _sheet(a, u, w, n, axis, x0, x1, per_voxel, doubled, label, owner, weight, a
 @kernel
 @no_type_check
 def _patch(a, u, w, size, per_voxel, x0, x1, label, owner, weight, area, best, instance):
-    """Split a triangle into congruent ones smaller than the sample spacing; each gives its area at its centroid."""
-    longest = 0.0
+    """Cut a triangle into rows along its longest edge, and rows into samples that give their share of its area."""
+    ends, longest, first = np.empty((3, 3)), -1.0, 0
+    for d in range(3):
+        ends[0, d], ends[1, d], ends[2, d] = a[d], a[d] + u[d], a[d] + w[d]
     for k in range(3):
         length = 0.0
         for d in range(3):
-            edge = u[d] if k == 0 else (w[d] if k == 1 else u[d] - w[d])
+            edge = ends[(k + 1) % 3, d] - ends[k, d]
             length += edge * edge
-        longest = max(longest, length)
-    n = max(1, math.ceil(math.sqrt(longest) * per_voxel))
-    share = size / (n * n)
-    for i in range(n):
-        for j in range(2 * (n - i) - 1):
-            off = 1 / 3 if j % 2 == 0 else 2 / 3
-            l1, l2 = (i + off) / n, (j // 2 + off) / n
-            x, y = math.floor(a[0] + l1 * u[0] + l2 * w[0]), math.floor(a[1] + l1 * u[1] + l2 * w[1])
-            z = math.floor(a[2] + l1 * u[2] + l2 * w[2])
+        if length > longest:
+            longest, first = length, k
+    longest = math.sqrt(longest)
+    p, q, r = ends[first], ends[(first + 1) % 3], ends[(first + 2) % 3]
+    rows = max(1, math.ceil(2 * size / longest * per_voxel))
+    for j in range(rows):
+        h = (j + 0.5) / rows
+        count = max(1, math.ceil(longest * (1 - h) * per_voxel))
+        share = size * (2 * (rows - j) - 1) / (rows * rows) / count
+        for i in range(count):
+            s = (i + 0.5) / count * (1 - h)
+            x = math.floor(p[0] + s * (q[0] - p[0]) + h * (r[0] - p[0]))
+            y = math.floor(p[1] + s * (q[1] - p[1]) + h * (r[1] - p[1]))
+            z = math.floor(p[2] + s * (q[2] - p[2]) + h * (r[2] - p[2]))
             _give(x, y, z, x0, x1, label, owner, share, weight, area, best, instance)
 
 
 @kernel
 @no_type_check
 def _cross(a, u, w, nz, x0, x1, label, crossings):
-    """Count where the upright lines through the middles of voxel columns pass through a triangle, with sign."""
+    """Count where the upright lines through the middles of voxel columns pass through a triangle, with sign.
+
+    One more layer than there are voxels tells which columns have crossings.
+    """
     X0, X1 = a[0] + min(0.0, u[0], w[0]), a[0] + max(0.0, u[0], w[0])
     Y0, Y1 = a[1] + min(0.0, u[1], w[1]), a[1] + max(0.0, u[1], w[1])
     for i in range(max(x0, math.ceil(X0 - 0.51)), min(x1 - 1, math.floor(X1 - 0.49)) + 1):
@@ -104,8 +114,9 @@ def _cross(a, u, w, nz, x0, x1, label, crossings):
             l1, l2 = (dx * w[1] - dy * w[0]) / nz, (u[0] * dy - u[1] * dx) / nz
             if l1 >= 0 and l2 >= 0 and l1 + l2 <= 1:
                 z = math.floor(a[2] + l1 * u[2] + l2 * w[2] + 0.5)  # the first cell whose middle is above
-                if z < crossings.shape[2]:
+                if z < crossings.shape[2] - 1:
                     crossings[i, j, max(z, 0), label] += 1 if nz < 0 else -1
+                    crossings[i, j, crossings.shape[2] - 1, 0] = 1
 
 
 @kernel
@@ -154,38 +165,46 @@ def splat(v, faces, chosen, labels, owners, closed, fill, weight, per_voxel, x0,
 
 @kernel
 @no_type_check
-def decide(area, crossings, fill, weight, least, free, x0, x1, instance, out):
+def decide(area, best, crossings, fill, weight, least, free, x0, x1, instance, out):
     """Label voxels x0 <= x < x1: the class of the largest weighted area; inside closed things theirs; else free.
 
     A column whose crossings of a class do not cancel is not filled. `instance` is cleared where it is free, and set
-    inside things to that of the voxel below.
+    inside things to that of the voxel below. `area`, `best` and `crossings` are zero again afterwards, which is cheaper
+    than to clear all of them before.
     """
     Y, Z, C = area.shape[1], area.shape[2], area.shape[3]
     inside, leaks = np.zeros(C, np.int64), np.zeros(C, np.bool_)
     last = np.zeros(C, np.int32)
     for x in range(x0, x1):
         for y in range(Y):
-            inside[:] = 0
-            last[:] = 0
+            crossed = crossings[x, y, Z, 0] != 0
+            if crossed:
+                inside[:] = 0
+                last[:] = 0
+                for z in range(Z):
+                    for c in range(C):
+                        inside[c] += crossings[x, y, z, c]
+                for c in range(C):
+                    leaks[c] = inside[c] != 0
+                inside[:] = 0
             for z in range(Z):
-                for c in range(C):
-                    inside[c] += crossings[x, y, z, c]
-            for c in range(C):
-                leaks[c] = inside[c] != 0
-            inside[:] = 0
-            for z in range(Z):
-                top, most, total = free, 0.0, 0.0
-                for c in range(C):
-                    total += area[x, y, z, c]
-                    if area[x, y, z, c] * weight[c] > most:
-                        most, top = area[x, y, z, c] * weight[c], c
-                if total < least:
-                    top = free
-                surface = top != free
-                for c in range(C):
-                    inside[c] += crossings[x, y, z, c]
-                    if fill[c] and inside[c] > 0 and not leaks[c] and (top == free or weight[top] < 0.2):
-                        top, surface = c, False
+                top, surface = free, False
+                if best[x, y, z] > 0:
+                    most, total = 0.0, 0.0
+                    for c in range(C):
+                        total += area[x, y, z, c]
+                        if area[x, y, z, c] * weight[c] > most:
+                            most, top = area[x, y, z, c] * weight[c], c
+                        area[x, y, z, c] = 0
+                    best[x, y, z] = 0
+                    if total < least:
+                        top = free
+                    surface = top != free
+                if crossed:
+                    for c in range(C):
+                        inside[c] += crossings[x, y, z, c]
+                        if fill[c] and inside[c] > 0 and not leaks[c] and (top == free or weight[top] < 0.2):
+                            top, surface = c, False
                 out[x, y, z] = top
                 if top == free:
                     instance[x, y, z] = 0
@@ -193,3 +212,5 @@ def decide(area, crossings, fill, weight, least, free, x0, x1, instance, out):
                     last[top] = instance[x, y, z]
                 else:
                     instance[x, y, z] = last[top]
+            if crossed:
+                crossings[x, y] = 0

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
-from openvocab_occ.datasets.city.labels import Labels, camera_directions, lidar_directions_world, observed
+from openvocab_occ.datasets.city.labels import Labels, lidar_directions_world, observed
 from openvocab_occ.datasets.city.movers import Mover
 from openvocab_occ.datasets.city.sensors import LIDAR_NOISE, LIDAR_RANGE, PERIOD, T_EGO_LIDAR, lidar_directions
 from openvocab_occ.datasets.city.surfaces import Material
@@ -15,9 +15,11 @@ from openvocab_occ.datasets.city.voxels import voxelise
 from openvocab_occ.datasets.frame import Frame, View
 from openvocab_occ.geometry import invert, transform
 from openvocab_occ.occupancy import OCC3D_FREE, OCC3D_SPEC, OccupancyGrid
+from openvocab_occ.occupancy.visibility import visibility_mask
 
 _LIDAR_SPAN = (-6, -3, 0, 3, 6)  # keyframes whose LiDAR poses count for mask_lidar
 _BEAM_STRIDE = 2  # of the columns of those sweeps
+_PIXEL_STRIDE = 3  # of rays for mask_camera: 0.2 m apart at 40 m
 BOX_RANGE = 60.0
 """Metres from the ego within which things get boxes."""
 _MOVED = 0.5  # m that tell moving from standing still
@@ -159,20 +161,26 @@ def labels(drive: Traversal, index: int, instant: Instant | None = None, *, mask
     poses = [drive.T_world_ego(n * PERIOD) @ T_EGO_LIDAR for n in stands]
     origins = np.array([T[:3, 3] for T in poses])
     mask_lidar = observed(whole, origins, [lidar_directions_world(thin, T) for T in poses])
+    returns = transform(T_EGO_LIDAR, sweep(drive, index, instant).points)
+    flat = OCC3D_SPEC.flat(OCC3D_SPEC.index(returns))
+    mask_lidar.reshape(-1)[flat[flat >= 0]] = True
     cameras = [camera for _, camera, _ in drive.cameras(index)]
-    eyes = np.array([camera.position for camera in cameras])
-    mask_camera = observed(whole, eyes, [camera_directions(camera) for camera in cameras]) & mask_lidar
     grid = OccupancyGrid(voxels.semantics, OCC3D_SPEC, T_world_ego, OCC3D_FREE, known=mask_lidar)
+    mask_camera = visibility_mask(grid, cameras, mode="pixel", stride=_PIXEL_STRIDE)
     return Labels(grid, voxels.instances, mask_lidar, mask_camera)
 
 
-def frame(drive: Traversal, index: int, *, size: tuple[int, int] = (704, 256), depth: bool = False, masks: bool = True
+def frame(drive: Traversal, index: int, *, size: tuple[int, int] = (704, 256), depth: bool = False, quick: bool = False
           ) -> Frame:  # fmt: skip
-    """Return a keyframe with images, occupancy and LiDAR; with `depth` also the true depth of every pixel."""
+    """Return a keyframe with images, occupancy and LiDAR; with `depth` also the true depth of every pixel.
+
+    A quick one is for training small models: the world stands still while the cameras fire, edges are not smoothed, and
+    all of the grid counts as known.
+    """
     instant = instant_of(drive, index)
     views, poses = [], {}
     for name, camera, time in drive.cameras(index, size):
-        picture = drive.render(camera, time, instant=instant)
+        picture = drive.render(camera, time, instant=instant, smooth=not quick, frozen=quick)
         views.append(View(picture.image, camera, picture.depth if depth else None, name))
         poses[f"{name.lower()}_ego"] = drive.T_world_ego(time)
     T_world_ego = drive.T_world_ego(index * PERIOD)
@@ -181,7 +189,7 @@ def frame(drive: Traversal, index: int, *, size: tuple[int, int] = (704, 256), d
         timestamp=drive.start_time() + index * PERIOD,
         T_world_ego=T_world_ego,
         views=tuple(views),
-        occupancy=labels(drive, index, instant, masks=masks).grid,
+        occupancy=labels(drive, index, instant, masks=not quick).grid,
         points=transform(T_EGO_LIDAR, sweep(drive, index, instant).points).astype(np.float32),
         token=f"{drive.name}-{index:03d}",
         poses={**poses, "lidar": T_world_ego @ T_EGO_LIDAR},

@@ -1,9 +1,9 @@
 """Occ3D labels of a keyframe: semantics, instances, and what LiDAR and cameras observe.
 
 `mask_lidar`: voxels that rays of the 32 beams cross before they hit, and those they hit, from where the ego stands at
-this keyframe and at four around it (Occ3D accumulates the sweeps of a scene); moving things are taken as they stand
-now. `mask_camera`: the same of rays through pixels of the six cameras, and within `mask_lidar`. Both walk the voxels,
-not the meshes, so that a mask agrees with the labels beside it.
+this keyframe and at four around it (Occ3D accumulates the sweeps of a scene), and those that hold a return of this
+sweep; moving things are taken as they stand now. `mask_camera`: `visibility_mask` by `pixel`, every third pixel of six
+704 x 256 images, within `mask_lidar`. Both walk the voxels, not the meshes, so that a mask agrees with its labels.
 """
 
 from dataclasses import dataclass
@@ -12,14 +12,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int32
 
 from openvocab_occ._jit import in_slices
-from openvocab_occ.geometry import Camera, transform
+from openvocab_occ.geometry import transform
 from openvocab_occ.occupancy import OccupancyGrid
 from openvocab_occ.occupancy._rays_kernels import mark_crossed
 from openvocab_occ.occupancy.rays import lattice_rays, trace
 
 _REACH = 110.0  # m, beyond any corner of the grid
 _INTO = 1e-3  # lengths of the direction beyond the entry into the voxel that is hit
-_PIXELS = 3  # a ray for every so many pixels of a 704-pixel row: 0.2 m at 40 m
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,16 +44,6 @@ def observed(
         stops = start[0] + steps
         in_slices(lambda i, j, a=start[0], b=stops: mark_crossed(a, b, i, j, seen), len(stops), grain=2048)
     return seen != 0
-
-
-def camera_directions(camera: Camera) -> Float[np.ndarray, "n 3"]:
-    """Return rays through every so many pixels, in the world."""
-    small = (
-        camera.resized(max(camera.width * 234 // 704, 1), max(camera.height * 234 // 704, 1))
-        if (camera.width > 234)
-        else camera
-    )
-    return small.rays().reshape(-1, 3) @ camera.T_world_cam[:3, :3].T
 
 
 def lidar_directions_world(directions: np.ndarray, T_world_lidar: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 3"]:

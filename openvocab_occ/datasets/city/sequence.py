@@ -17,9 +17,11 @@ def _city(seed: int) -> City:
 
 def load_city(
     root: PathLike | None = None, *, scene: str | None = None, seed: int = 0, route: int = 0, traversal: int = 0,
-    condition: str = "clear", frames: int = MAX_FRAMES, size: tuple[int, int] = (704, 256),
+    condition: str = "clear", frames: int = MAX_FRAMES, size: tuple[int, int] = (704, 256), quick: bool = False,
 ) -> FrameSequence:  # fmt: skip
     """Drive through the demo city, two frames a second; see `City.traversal`. Frames are rendered when asked for.
+
+    `quick` frames, for training small models, have no masks and no smooth edges; see `keyframes.frame`.
 
     Raises:
         ConfigError: A root or a scene is given, a number is out of range, or the condition is not known.
@@ -35,7 +37,7 @@ def load_city(
     return FrameSequence(
         drive.name,
         range(frames),
-        lambda index: frame(drive, index, size=(width, height)),
+        lambda index: frame(drive, index, size=(width, height), quick=quick),
         source="city",
         synthetic=True,
     )

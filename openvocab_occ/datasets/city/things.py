@@ -1,6 +1,7 @@
 """A thing of the city: a mesh at a place, and what is true of it."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -46,7 +47,12 @@ class Thing:
 
     def part_numbers(self) -> tuple[int, ...]:
         """Return the parts that its mesh has."""
-        return tuple(int(p) for p in np.unique(self.mesh.part))
+        return _parts(self.mesh)
+
+
+@lru_cache(maxsize=1024)
+def _parts(mesh: Mesh) -> tuple[int, ...]:
+    return tuple(int(p) for p in np.unique(mesh.part))
 
 
 def flat_pose(position: tuple[float, float, float], yaw: float) -> Float[np.ndarray, "4 4"]:

@@ -1,6 +1,7 @@
 """What stands in the town for good, or is built and torn down between traversals."""
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -81,8 +82,9 @@ class _Planter:
         )  # fmt: skip
 
 
+@lru_cache(maxsize=2)
 def build_town(seed: int) -> Town:
-    """Draw a town; the same seed gives the same town."""
+    """Draw a town; the same seed gives the same town. The last two are kept."""
     plan = draw_plan(np.random.default_rng([seed, 11]))
     planter = _Planter(plan, np.random.default_rng([seed, 12]))
     for zone, mesh in ground_meshes(plan).items():

@@ -23,7 +23,7 @@ from openvocab_occ.occupancy import OCC3D_CLASSES
 
 _LATTICE = 16.0  # m; things are gathered around a point of it, so that a picture does not depend on earlier ones
 _KEPT = 3  # gathered places
-_MOVER_SIGHT = 130.0
+_MOVER_SIGHT = 110.0
 _LAMP_SIGHT = 60.0
 _CELL, _CELLS = 0.4, 320  # of the map of what stands on the ground
 MAX_FRAMES = round(DURATION / PERIOD)
@@ -52,6 +52,8 @@ class Instant:
     surroundings: Surroundings
     movers: tuple[Mover, ...]
     """Those in the table, in its order."""
+    ground: Float32[np.ndarray, "x y"]
+    """How much stands on each cell of the ground around the origin, softened."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,7 +168,9 @@ class Traversal:
         near = [i for i, p in enumerate(poses) if np.hypot(*(p[:2, 3] - around.origin[:2])) < _MOVER_SIGHT]
         table = gather([self.movers[i].thing for i in near], [poses[i] for i in near], around.origin, cull=False)
         moment = Moment(around.caster, Caster(table.vertices, table.faces), len(around.triangles))
-        return Instant(joined(around.triangles, table), moment, around, tuple(self.movers[i] for i in near))
+        movers = tuple(self.movers[i] for i in near)
+        ground = _stamp(around.ground.copy(), [m.thing for m in movers], [poses[i] for i in near], around.origin)
+        return Instant(joined(around.triangles, table), moment, around, movers, _blurred(ground))
 
     def forget(self) -> None:
         """Drop what was gathered around places, to save memory."""
@@ -183,20 +187,23 @@ class Traversal:
         faces = instant.triangles.faces[still:] - np.uint32(len(around.triangles.vertices))
         return Moment(around.caster, Caster(vertices, faces), still)
 
-    def render(self, camera: Camera, time: float, *, instant: Instant | None = None, smooth: bool = True) -> Rendering:
+    def render(
+        self, camera: Camera, time: float, *, instant: Instant | None = None, smooth: bool = True, frozen: bool = False
+    ) -> Rendering:
         """Take a picture.
 
         Args:
             camera: Anywhere in the world.
             time: Seconds from the first keyframe.
             instant: Of a time near by, to save work when several cameras share it.
-            smooth: Take more samples where surfaces meet; half as fast again.
+            smooth: Take more samples where surfaces meet.
+            frozen: Moving things stay where they are at the instant, not where they are at the time.
         """
         if instant is None:
             instant = self.instant(time, camera.position)
             moment = instant.moment
         else:
-            moment = self.moved(instant, time)
+            moment = instant.moment if frozen else self.moved(instant, time)
         origin = instant.surroundings.origin
         T = camera.T_world_cam.copy()
         T[:3, 3] -= origin
@@ -207,13 +214,11 @@ class Traversal:
 
     def _lighting(self, instant: Instant, time: float, eye: np.ndarray) -> Lighting:
         around = instant.surroundings
-        poses = [self.mover_pose(m, time) for m in instant.movers]
-        ground = _stamp(around.ground.copy(), [m.thing for m in instant.movers], poses, around.origin)
         return Lighting(
             condition=self.condition,
             light=light_vector(self.condition, self._azimuth, self._drift),
             lamps=self._lamps(instant, time, eye),
-            ground=_blurred(ground),
+            ground=instant.ground,
             origin=np.full(2, -_CELL * _CELLS / 2),
             cell=_CELL,
             anchor=around.origin[:2].copy(),

@@ -49,7 +49,7 @@ class Voxels:
 
 
 class _Scratch(threading.local):
-    """Big arrays that a thread uses again."""
+    """Big arrays that a thread uses again; all zero between uses."""
 
     def __init__(self) -> None:
         self.shape: tuple[int, int, int] | None = None
@@ -57,9 +57,9 @@ class _Scratch(threading.local):
     def of(self, shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if self.shape != shape:
             self.shape = shape
-            self.area = np.empty((*shape, _CLASSES), np.float32)
-            self.crossings = np.empty((*shape, _CLASSES), np.int8)
-            self.best = np.empty(shape, np.float32)
+            self.area = np.zeros((*shape, _CLASSES), np.float32)
+            self.crossings = np.zeros((*shape[:2], shape[2] + 1, _CLASSES), np.int8)
+            self.best = np.zeros(shape, np.float32)
         return self.area, self.crossings, self.best
 
 
@@ -89,10 +89,13 @@ def voxelise(triangles: Triangles, T_grid_local: Float[np.ndarray, "4 4"], spec:
     label, owner, closed = triangles.label, triangles.instance, triangles.solid
 
     def work(x0: int, x1: int) -> None:
-        area[x0:x1], crossings[x0:x1], best[x0:x1] = 0, 0, 0
         splat(v, triangles.faces, chosen, label, owner, closed, FILL, WEIGHT, _SAMPLES, x0, x1, area, best, instances,
               crossings)  # fmt: skip
-        decide(area, crossings, FILL, WEIGHT, _LEAST / size**2, OCC3D_FREE, x0, x1, instances, semantics)
+        decide(area, best, crossings, FILL, WEIGHT, _LEAST / size**2, OCC3D_FREE, x0, x1, instances, semantics)
 
-    in_slices(work, spec.shape[0], grain=8)
+    try:
+        in_slices(work, spec.shape[0], grain=8)
+    except BaseException:
+        _scratch.shape = None  # may not be zero
+        raise
     return Voxels(semantics, instances)

@@ -8,6 +8,7 @@ from openvocab_occ.datasets.city import CONDITIONS, LABELS, SKY, City
 from openvocab_occ.datasets.city.keyframes import boxes, sweep
 from openvocab_occ.datasets.city.sensors import RIG, T_EGO_LIDAR
 from openvocab_occ.datasets.city.streets import draw_plan
+from openvocab_occ.datasets.city.town import build_town
 from openvocab_occ.errors import ConfigError
 from openvocab_occ.geometry import Camera, invert, transform
 
@@ -30,6 +31,13 @@ def test_a_camera_sees_the_same_twice(drive, instant, pictures):
         np.testing.assert_array_equal(getattr(found, field), getattr(pictures[1][2], field), err_msg=field)
     alone = again.render(camera, time)
     assert (alone.instance == found.instance).mean() > 0.999
+    rebuilt = build_town.__wrapped__(7)
+    assert rebuilt is not again.town
+    assert [(t.kind, t.position, t.yaw, t.exists) for t in rebuilt.things] == [
+        (t.kind, t.position, t.yaw, t.exists) for t in again.town.things
+    ]
+    for a, b in zip(rebuilt.things[:4], again.town.things[:4], strict=True):
+        np.testing.assert_array_equal(a.mesh.vertices, b.mesh.vertices)
     elsewhere = draw_plan(np.random.default_rng([8, 11]))
     assert elsewhere.bounds != again.town.plan.bounds
 
