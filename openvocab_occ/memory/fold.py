@@ -10,11 +10,13 @@ from openvocab_occ._jit import in_slices
 from openvocab_occ.errors import ConfigError, MapError
 from openvocab_occ.memory import journal
 from openvocab_occ.memory._tiles_kernels import merge_rows
+from openvocab_occ.memory.clock import ticks_of
+from openvocab_occ.memory.footprint import tile_rows
 from openvocab_occ.memory.journal import Entry, EntryName
 from openvocab_occ.memory.layer import Layer, TileKey
 from openvocab_occ.memory.schema import CELLS, MapSchema, Tile
 from openvocab_occ.memory.store import Location, agent_number
-from openvocab_occ.memory.tile_map import TileMap, ticks_of, tile_rows
+from openvocab_occ.memory.tile_map import TileMap
 from openvocab_occ.memory.window import Window
 
 FoldPolicy = Literal["newest", "bayes", "ema"]

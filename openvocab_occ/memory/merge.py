@@ -10,10 +10,11 @@ from openvocab_occ.errors import ConfigError
 from openvocab_occ.memory import journal
 from openvocab_occ.memory._tiles_kernels import merge_tiles
 from openvocab_occ.memory.changes import centers
+from openvocab_occ.memory.footprint import tile_rows
 from openvocab_occ.memory.layer import TileKey
 from openvocab_occ.memory.schema import CELLS, Tile
 from openvocab_occ.memory.store import agent_number
-from openvocab_occ.memory.tile_map import TileMap, tile_rows
+from openvocab_occ.memory.tile_map import TileMap
 
 
 @dataclass(frozen=True, eq=False)
