@@ -40,8 +40,8 @@ class Street:
 def passes(folder: Path, *, street: Street | None = None, count: int = 4) -> dict[str, Any]:
     """Drive a street `count` times by day; judge the map after each pass by one more drive, by day and at night.
 
-    mIoU in percent over the voxels that the cameras of that last drive see and that the map knew after one pass, against
-    the truth of that drive: what was parked elsewhere then counts against the map.
+    mIoU in percent over the voxels that the cameras of that last drive see and that the map knew after one pass,
+    against the truth of that drive: what was parked elsewhere then counts against the map.
     """
     street = street or Street()
     town = City(street.seed)
@@ -121,8 +121,9 @@ def pose_noise(
     for off in metres:
         for turn in degrees:
             priors = [city.read(moved(i, t.grid.T_world_grid, off, turn), t.grid.spec).logits for i, t in drives[1]]
-            row = {"metres": off, "degrees": turn, "prior": _score(priors, truths, masks)["mIoU"],
-                   "fused": _score([a + b for a, b in zip(now, priors, strict=True)], truths, masks)["mIoU"]}  # fmt: skip
+            both = [a + b for a, b in zip(now, priors, strict=True)]
+            row = {"metres": off, "degrees": turn, "prior": _score(priors, truths, masks)["mIoU"]}
+            row["fused"] = _score(both, truths, masks)["mIoU"]
             if turn == 2 * off:  # along the diagonal of the sweep
                 other = written(f"off-{off}", off, turn)
                 row["written"] = _score(
@@ -152,9 +153,9 @@ def fence(folder: Path, *, before: int = 20, after: int = 12, seed: int = 5) -> 
         city.write(_logits(seen), all_seen, np.eye(4), spec, stamp=n / 2, agent="car", log="day")
     ways = {
         "newest": FoldConfig(),
-        "bayes, limit 20": FoldConfig(policy="bayes"),
-        "bayes, limit 60": FoldConfig(policy="bayes", limit=60.0),
-        "bayes, limit 60, half-life 5 s": FoldConfig(policy="bayes", limit=60.0, half_life=5.0),
+        "bayes": FoldConfig(policy="bayes"),
+        "bayes, limit 20": FoldConfig(policy="bayes", limit=20.0),
+        "bayes, limit 20, half-life 5 s": FoldConfig(policy="bayes", limit=20.0, half_life=5.0),
         "ema 0.3": FoldConfig(policy="ema"),
         "ema 0.1": FoldConfig(policy="ema", weight=0.1),
     }

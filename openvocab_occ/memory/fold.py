@@ -32,8 +32,9 @@ class FoldConfig:
     write were independent evidence. `ema`: an exponential mean."""
     half_life: float | None = None
     """Of `bayes`: seconds after which evidence counts half; None for never."""
-    limit: float = 20.0
-    """Of `bayes`: no logit grows beyond it, so that a changed world is believed again after some writes."""
+    limit: float = 8.0
+    """Of `bayes`: no class falls further below the best one, so that a changed world is believed again after some looks.
+    A `uint8` map keeps no more than 9."""
     weight: float = 0.3
     """Of `ema`: share of a new write."""
 
@@ -225,7 +226,9 @@ class _Evidence:
             if self._fold.half_life is not None:
                 age = (entry.stamp - before.astype(np.float64)) / 1000
                 old = old * np.exp2(-age / self._fold.half_life).astype(np.float32)[:, None]
-            mixed = np.clip(old + new, -self._fold.limit, self._fold.limit)
+            mixed = old + new
+            mixed -= mixed.max(axis=-1, keepdims=True)
+            np.maximum(mixed, -self._fold.limit, out=mixed)
         self._state[hit] = mixed
         self._tile.stamps[hit] = entry.stamp
         self._tile.writers[hit] = agent_number(entry.agent)
