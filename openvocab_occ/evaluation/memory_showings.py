@@ -21,6 +21,7 @@ from openvocab_occ.occupancy import OCC3D_CLASSES, OCC3D_FREE, OccupancyGrid
 _DAY = 86400.0
 _MANMADE, _ROAD = OCC3D_CLASSES.index("manmade"), OCC3D_CLASSES.index("driveable surface")
 _FOLDS = ("newest", "bayes", "ema")
+_PASSES = 2  # of the map that is read with wrong poses
 
 
 @dataclass(frozen=True)
@@ -89,15 +90,16 @@ def pose_noise(
 ) -> dict[str, Any]:  # fmt: skip
     """Read a map at poses that are off by so much, in directions drawn for each keyframe.
 
-    `prior` is the mIoU in percent of the prior alone, `fused` with what is seen by day, `written` of a map whose own
-    poses were off by that much when it was written and that is read where it should be.
+    The map is of two passes, folded by `bayes`. `prior` is the mIoU in percent of the prior alone, `fused` with what is
+    seen by day, `written` of a map whose second pass was off by that much when it was written, read where it should be.
     """
     street = street or Street(frames=(8, 16, 24))
     town = City(street.seed)
-    drives = [[*street.keyframes(town, number, "clear")] for number in range(2)]
+    drives = [[*street.keyframes(town, number, "clear")] for number in range(_PASSES + 1)]
+    last = drives.pop()
     rng = np.random.default_rng(street.seed)
     turns = {index: (rng.uniform(0, 2 * np.pi), rng.choice([-1.0, 1.0])) for index in street.frames}
-    seen = {i: perceive(t, seed=_seed(street, 0, i)) for i, t in drives[0]}
+    seen = [(n, i, t, perceive(t, seed=_seed(street, n, i))) for n, drive in enumerate(drives) for i, t in drive]
 
     def moved(index: int, T: np.ndarray, off: float, turn: float) -> np.ndarray:
         heading, sign = turns[index]
@@ -106,21 +108,22 @@ def pose_noise(
         return T @ error
 
     def written(name: str, off: float, turn: float) -> TileMap:
-        city = TileMap.create(folder / f"{name}.tiles", OCC3D_CLASSES, journal=False)
-        for index, truth in drives[0]:
-            grid = seen[index]
-            city.write(_logits(grid), truth.mask_camera, moved(index, grid.T_world_grid, off, turn), grid.spec,
-                       stamp=float(index), agent="car", log="day")  # fmt: skip
-        return city
+        city = TileMap.create(folder / f"{name}.tiles", OCC3D_CLASSES)
+        for number, index, truth, grid in seen:
+            T = moved(index, grid.T_world_grid, off, turn) if number else grid.T_world_grid
+            city.write(_logits(grid), truth.mask_camera, T, grid.spec,
+                       stamp=number * _DAY + index, agent="car", log=f"day-{number}")  # fmt: skip
+        rebuild(city, out=folder / f"{name}-bayes.tiles", policy="bayes")
+        return TileMap.open(folder / f"{name}-bayes.tiles")
 
     city = written("clean", 0.0, 0.0)
-    truths = [t for _, t in drives[1]]
+    truths = [t for _, t in last]
     masks = [city.read(t.grid.T_world_grid, t.grid.spec).known & t.mask_camera for t in truths]
-    now = [_centred(_logits(perceive(t, seed=_seed(street, 99, i)))) for i, t in drives[1]]
+    now = [_centred(_logits(perceive(t, seed=_seed(street, 99, i)))) for i, t in last]
     rows = []
     for off in metres:
         for turn in degrees:
-            priors = [city.read(moved(i, t.grid.T_world_grid, off, turn), t.grid.spec).logits for i, t in drives[1]]
+            priors = [city.read(moved(i, t.grid.T_world_grid, off, turn), t.grid.spec).logits for i, t in last]
             both = [a + b for a, b in zip(now, priors, strict=True)]
             row = {"metres": off, "degrees": turn, "prior": _score(priors, truths, masks)["mIoU"]}
             row["fused"] = _score(both, truths, masks)["mIoU"]

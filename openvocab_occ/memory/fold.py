@@ -33,8 +33,8 @@ class FoldConfig:
     half_life: float | None = None
     """Of `bayes`: seconds after which evidence counts half; None for never."""
     limit: float = 8.0
-    """Of `bayes`: no class falls further below the best one, so that a changed world is believed again after some looks.
-    A `uint8` map keeps no more than 9."""
+    """Of `bayes`: no class falls further below the best one, so that a changed world is believed after some looks. A
+    `uint8` map keeps no more than 9."""
     weight: float = 0.3
     """Of `ema`: share of a new write."""
 
