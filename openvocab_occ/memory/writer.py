@@ -32,7 +32,8 @@ class Writer:
         """Begin; `most` writes may wait, the next one has to."""
         if most < 1:
             raise ConfigError("most is not usable", expected="1 or more writes", got=most)
-        self._city, self._agent, self._log, self._policy, self._most = city, agent, log, policy, most
+        self._city, self._agent, self._log, self._most = city, agent, log, most
+        self._policy: Policy = policy
         self._waiting: deque[Entry] = deque()
         self._error: Exception | None = None
         self._closed = False

@@ -297,7 +297,7 @@ def _quoted(text: str) -> str:
 
 def _lance() -> Any:
     try:
-        import lance
+        import lance  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise MissingExtraError("the city index needs Lance", fix="pip install 'openvocab_occ[scale]'") from error
     return lance

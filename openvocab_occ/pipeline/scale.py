@@ -222,7 +222,7 @@ def _open_or_create(path: str, schema: MapSchema) -> TileMap:
 
 def _ray() -> Any:
     try:
-        import ray
+        import ray  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise MissingExtraError("scale-out needs Ray", fix="pip install 'openvocab_occ[scale]'") from error
     return ray
