@@ -16,6 +16,7 @@ import numpy as np
 FLEETS = (10, 1_000, 100_000)
 DAY = 86_400.0
 TILE_M = 25.6
+WINDOW_M = 80.0
 
 
 @dataclass(frozen=True)
@@ -32,8 +33,8 @@ class City:
     """Between written keyframes."""
     peak: float = 3.0
     """Busiest hour over the mean."""
-    skew: float = 0.8
-    """Zipf exponent: the n-th busiest street has 1 / n^skew of the busiest one's traffic."""
+    skew: float = 0.35
+    """Zipf exponent: the n-th busiest stretch has 1 / n^skew of the busiest one's traffic: 46 times the mean."""
     refresh_s: float = 3_600.0
     """With a rule: a tile that is younger is not written again."""
 
@@ -90,8 +91,8 @@ def day(vehicles: int, city: City, costs: Costs, *, rule: bool) -> dict[str, flo
     commits = writes / costs.batch
     rate = commits / DAY * city.peak
     puts = rate * costs.chunks_of_batch(city)
-    busiest = float((visits * kept).max()) * TILE_M / city.spacing_m / costs.batch / DAY * city.peak
-    busiest *= costs.chunks_of_batch(city) ** 0.5  # windows reach over tiles ahead and behind
+    commits_of_pass = (TILE_M + WINDOW_M) / city.spacing_m / costs.batch + 1  # windows reach it before and after
+    busiest = float((visits * kept).max()) * commits_of_pass / DAY * city.peak
     return {
         "km": km, "writes": writes, "written": passed, "writes_s": rate * costs.batch, "puts_s": puts,
         "put_mb_s": puts * costs.chunk_bytes / 1e6, "cores": rate * costs.batch * costs.cpu_s,
