@@ -27,8 +27,6 @@ from openvocab_occ.memory.observe import observe
 from openvocab_occ.memory.schema import MapSchema
 from openvocab_occ.memory.writer import Writer
 from openvocab_occ.occupancy import OccupancyGrid
-from openvocab_occ.pipeline.build import build_map
-from openvocab_occ.segmentation.onnx import load_encoder
 
 _IN_FLIGHT = 256  # tasks given to Ray at a time
 
@@ -186,6 +184,9 @@ def run_log(job: LogJob, scratch: str) -> LogResult:
     writer.close()
     scene = None
     if job.encoder is not None:
+        from openvocab_occ.pipeline.build import build_map  # only then: seconds of import for each worker
+        from openvocab_occ.segmentation.onnx import load_encoder
+
         scene = f"{scratch.rstrip('/')}/{job.name}.ovmap"
         build_map(sequence, load_encoder(job.encoder)).save(scene)
     keys = sorted({key for layer in city.layers() for key in layer.stored()})

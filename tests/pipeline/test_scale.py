@@ -63,13 +63,15 @@ def ray_engine(tmp_path_factory):
     root = str(Path(__file__).resolve().parents[2])
     ray.init(
         num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=80 * 2**20,
-        runtime_env={"env_vars": {"PYTHONPATH": root, "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}},
+        _system_config={"worker_niceness": 0},
+        runtime_env={"env_vars": {"PYTHONPATH": root}},
     )  # fmt: skip
     yield RayEngine()
     ray.shutdown()
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)  # workers start slowly on a busy machine
 @pytest.mark.filterwarnings("ignore")
 def test_ray_makes_the_same_city(tmp_path, serial, ray_engine):
     """Real Ray on this machine: logs and tiles in its workers; what a task raises arrives as it is."""
