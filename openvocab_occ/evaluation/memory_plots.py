@@ -27,8 +27,8 @@ def draw_passes(report: dict[str, Any], path: Path) -> None:
         bars = right.bar([n + 0.4 * at for n in range(3)], values, 0.38, color=color, label=condition)
         right.bar_label(bars, fmt="%.0f", fontsize=8)
     right.set_xticks([n + 0.2 for n in range(3)], ways)
-    right.set(ylabel="mIoU, %")
-    right.legend(frameon=False, title="what is seen now", fontsize=8, title_fontsize=8)
+    right.set(ylabel="mIoU, %", ylim=(0, 80))
+    right.legend(frameon=False, title="seen now by", fontsize=8, title_fontsize=8, ncols=2, loc="upper right")
     figure.suptitle("Synthetic city, stand-in for perception", fontsize=9)
     _save(figure, path)
 
@@ -37,14 +37,15 @@ def draw_fence(report: dict[str, Any], path: Path) -> None:
     """Write how much of a demolished fence is left after each look."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(6, 3.6), dpi=150, layout="constrained")
+    figure = Figure(figsize=(8, 3.6), dpi=150, layout="constrained")
     axis = figure.subplots()
     for name, left in report["left"].items():
         looks = report["frames"][name]
         axis.plot(range(len(left)), [100 * share for share in left], "o-", markersize=3,
                   label=f"{name}: {f'more than {len(left) - 1}' if looks is None else looks}")  # fmt: skip
     axis.set(xlabel="looks since it is gone", ylabel="of the fence that the map holds, %")
-    axis.legend(frameon=False, fontsize=8, title="looks to forget", title_fontsize=8)
+    axis.set_title("Synthetic fence, stand-in for perception", fontsize=9)
+    figure.legend(frameon=False, fontsize=8, title="looks to forget", title_fontsize=8, loc="outside right center")
     _save(figure, path)
 
 
@@ -63,7 +64,8 @@ def draw_pose_noise(report: dict[str, Any], path: Path) -> None:
         axis.axhline(report["seen"], color="grey", linestyle=":", label="seen alone")
         axis.set(xlabel="pose off by, metres", title=title)
     axes[0].set(ylabel="mIoU, %", ylim=(0, None))
-    axes[1].legend(frameon=False, fontsize=8)
+    axes[1].legend(frameon=False, fontsize=8, ncols=2)
+    figure.suptitle("Synthetic city, stand-in for perception", fontsize=9)
     _save(figure, path)
 
 
@@ -77,7 +79,9 @@ def draw_revisits(reports: list[dict[str, Any]], path: Path) -> None:
     for axis, report in zip(axes, reports, strict=True):
         p = report["places"]
         points = axis.scatter(p["x"], p["y"], c=p["found"], s=9, cmap="viridis", vmin=0, vmax=1)
-        axis.set(aspect="equal", xlabel="m", title=report["route"])
+        axis.set_title(report["route"], fontsize=9)
+        axis.set_aspect("equal", adjustable="datalim")
+        axis.set_xlabel("m")
     if points is not None:
         figure.colorbar(points, ax=[*axes], label="of what is seen, with a prior", shrink=0.8)
     _save(figure, path)

@@ -91,7 +91,8 @@ def pose_noise(
     """Read a map at poses that are off by so much, in directions drawn for each keyframe.
 
     The map is of two passes, folded by `bayes`. `prior` is the mIoU in percent of the prior alone, `fused` with what is
-    seen by day, `written` of a map whose second pass was off by that much when it was written, read where it should be.
+    seen by day, `written` of a map whose second pass was off by that much when it was written, read where it should be
+    (for the first of `degrees`).
     """
     street = street or Street(frames=(8, 16, 24))
     town = City(street.seed)
@@ -127,7 +128,7 @@ def pose_noise(
             both = [a + b for a, b in zip(now, priors, strict=True)]
             row = {"metres": off, "degrees": turn, "prior": _score(priors, truths, masks)["mIoU"]}
             row["fused"] = _score(both, truths, masks)["mIoU"]
-            if turn == 2 * off:  # along the diagonal of the sweep
+            if turn == degrees[0]:
                 other = written(f"off-{off}", off, turn)
                 row["written"] = _score(
                     [other.read(t.grid.T_world_grid, t.grid.spec).logits for t in truths], truths, masks

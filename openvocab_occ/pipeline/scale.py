@@ -102,12 +102,12 @@ class RayEngine:
 
     def run(self, task: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
         """Yield task(*a) for each a, in order."""
-        remote = self._ray.remote(**self._options)(task)
+        remote = self._ray.remote(**self._options)(_call)  # Ray takes Python's own functions only
         waiting: list[Any] = []
         todo = iter(arguments)
         try:
             while True:
-                waiting += [remote.remote(*each) for each in islice(todo, _IN_FLIGHT - len(waiting))]
+                waiting += [remote.remote(task, *each) for each in islice(todo, _IN_FLIGHT - len(waiting))]
                 if not waiting:
                     return
                 yield self._ray.get(waiting.pop(0))
@@ -219,6 +219,10 @@ def _open_or_create(path: str, schema: MapSchema) -> TileMap:
             path, schema.class_names, heights=schema.heights, cell=schema.cell, z0=schema.z0, dtype=schema.dtype,
             journal=schema.journal,
         )  # fmt: skip
+
+
+def _call(task: Callable[..., Any], *arguments: Any) -> Any:
+    return task(*arguments)
 
 
 def _ray() -> Any:

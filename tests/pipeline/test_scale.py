@@ -82,9 +82,10 @@ def test_ray_makes_the_same_city(tmp_path, serial, ray_engine):
     assert built.logs[1].scene is not None
     assert Path(built.logs[1].scene, "manifest.json").is_file()
     assert [*ray_engine.run(divmod, [(7, 2), (9, 4)])] == [(3, 1), (2, 1)]
-    with pytest.raises(DataError, match="has no frames"):
-        empty = LogJob(name="x", agent="a", drive=list)
+    empty = LogJob(name="x", agent="a", drive=list)
+    with pytest.raises(DataError, match="log 'x' has no frames"):
         build_city([empty], str(tmp_path / "none.tiles"), scratch=str(tmp_path / "logs"), engine=ray_engine)
+    assert not (tmp_path / "none.tiles").exists()
 
 
 def vars_of(job: LogJob) -> dict[str, object]:
