@@ -195,7 +195,6 @@ def run_log(job: LogJob, scratch: str) -> LogResult:
 
 def reduce_tile(out: str, sources: Sequence[str], key: TileKey) -> int:
     """Merge one tile of several maps into a city; return how many records changed."""
-    key = TileKey(*key)
     parts = [tile for path in sources for _, tile in TileMap.open(path, writable=False).tiles(keys=[key])]
     return put_tiles(TileMap.open(out).layers()[0], {key: merged(parts)}) if parts else 0
 

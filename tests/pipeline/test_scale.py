@@ -9,6 +9,7 @@ from openvocab_occ.datasets.registry import load_sequence
 from openvocab_occ.errors import ConfigError, DataError
 from openvocab_occ.memory import TileMap, journal
 from openvocab_occ.memory.health import verify
+from openvocab_occ.memory.layer import TileKey
 from openvocab_occ.memory.observe import observe
 from openvocab_occ.pipeline.scale import LocalEngine, LogJob, RayEngine, build_city, reduce_tile
 from openvocab_occ.segmentation.demo_models import street_model
@@ -98,4 +99,4 @@ def test_refused(tmp_path):
     assert not [*tmp_path.iterdir()]
     assert [*LocalEngine().run(divmod, [])] == []
     city = TileMap.create(tmp_path / "c", ("a", "free"))
-    assert reduce_tile(city.store.name, (), (0, 0, 0)) == 0
+    assert reduce_tile(city.store.name, (), TileKey(0, 0, 0)) == 0
