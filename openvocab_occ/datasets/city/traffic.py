@@ -79,7 +79,11 @@ class Simulation:
         self._graph, self._drivers, self._walkers = graph, drivers, walkers
         self._edges = [list(accumulate((graph.lanes[n].length for n in d.route), initial=0.0)) for d in drivers]
         self._lines = [
-            (lane.arc.tolist(), lane.points[:, :2].tolist(), np.arctan2(*np.diff(lane.points, axis=0).T[1::-1]).tolist())
+            (
+                lane.arc.tolist(),
+                lane.points[:, :2].tolist(),
+                np.arctan2(*np.diff(lane.points, axis=0).T[1::-1]).tolist(),
+            )
             for lane in graph.lanes
         ]  # scalars are faster than arrays of one
         self._holders: dict[int, set[int]] = {}  # turn -> drivers in it or let into it
