@@ -12,6 +12,7 @@ bytes: a tile is the greatest record of each voxel, whoever writes it and how of
 import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -173,15 +174,15 @@ def run_log(job: LogJob, scratch: str) -> LogResult:
     path = f"{scratch.rstrip('/')}/{job.name}.tiles"
     city: TileMap | None = None
     writer: Writer | None = None
-    for frame in sequence:
-        seen = observe(frame)
-        if city is None or writer is None:
-            city = _of_grid(path, frame.occupancy)
-            writer = Writer(city, agent=job.agent, log=job.name)
-        writer.write(seen.logits, seen.mask, seen.T_world_grid, seen.spec, stamp=seen.time + job.start)
-    if city is None or writer is None:
+    with ExitStack() as opened:
+        for frame in sequence:
+            seen = observe(frame)
+            if city is None or writer is None:
+                city = _of_grid(path, frame.occupancy)
+                writer = opened.enter_context(Writer(city, agent=job.agent, log=job.name))
+            writer.write(seen.logits, seen.mask, seen.T_world_grid, seen.spec, stamp=seen.time + job.start)
+    if city is None:
         raise DataError(f"log {job.name!r} has no frames", expected="at least one")
-    writer.close()
     scene = None
     if job.encoder is not None:
         from openvocab_occ.pipeline.build import build_map  # only then: seconds of import for each worker
