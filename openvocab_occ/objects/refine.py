@@ -202,7 +202,10 @@ def _split(kept: dict[int, Track], names: Sequence[str]) -> int:
         track = kept[id]
         if track.moved or track.last is None:
             continue
-        pieces = cut_bridge(track.voxels, class_of(track, names), track.voxel_size)
+        seen = track.voxels  # a thing is judged by its hidden side too
+        whole = np.union1d(seen, track.body)
+        pieces = [np.intersect1d(p, seen) for p in cut_bridge(whole, class_of(track, names), track.voxel_size)]
+        pieces = [piece for piece in pieces if len(piece)]
         pieces.sort(key=len, reverse=True)
         for number, piece in enumerate(pieces if len(pieces) > 1 else []):
             part = track.of_voxels(piece, id if number == 0 else fresh)
