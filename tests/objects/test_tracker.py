@@ -77,7 +77,7 @@ def test_what_starts_to_stand_is_stopped():
 def test_an_empty_street_has_no_tracks():
     tracker, ids = follow([[], [], []])
     assert ids == [[], [], []]
-    assert refine(tracker.tracks, together={}, apart=set(), names=NAMES)[0] == []
+    assert refine(tracker.tracks, together={}, apart={}, names=NAMES)[0] == []
 
 
 def test_two_trucks_bumper_to_bumper_are_cut_at_the_neck():
@@ -92,7 +92,7 @@ def test_two_trucks_bumper_to_bumper_are_cut_at_the_neck():
     lengths = sorted(len(t.voxels) for t in tracks)
     assert lengths[0] / lengths[1] > 0.75
     assert sum(lengths) == len(tracker.tracks[1].voxels)
-    whole, off, _ = refine(tracker.tracks, together={}, apart=set(), names=NAMES, config=RefineConfig(split=False))
+    whole, off, _ = refine(tracker.tracks, together={}, apart={}, names=NAMES, config=RefineConfig(split=False))
     assert (len(whole), off.split) == (1, 0)
 
 
@@ -121,9 +121,9 @@ def test_pieces_of_one_thing_merge_and_two_things_do_not():
 
 def test_noise_is_dropped_when_asked():
     tracker, _ = follow([[block("car", (0, 0, 0), (2, 1, 1)), car(20)], [car(20)]])
-    kept, done, _ = refine(tracker.tracks, together={}, apart=set(), names=NAMES)
+    kept, done, _ = refine(tracker.tracks, together={}, apart={}, names=NAMES)
     assert (len(kept), done.dropped) == (1, 1)
-    kept, done, _ = refine(tracker.tracks, together={}, apart=set(), names=NAMES, config=RefineConfig(drop=False))
+    kept, done, _ = refine(tracker.tracks, together={}, apart={}, names=NAMES, config=RefineConfig(drop=False))
     assert (len(kept), done.dropped) == (2, 0)
 
 
