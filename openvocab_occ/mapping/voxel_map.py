@@ -167,6 +167,10 @@ class VoxelMap:
         """How many frames named each class of the occupancy; no columns where the map counts none."""
         return self._cached("label_counts", lambda: self._records.histogram[self._order])
 
+    def best_views(self, positions: Int[np.ndarray, " m"]) -> tuple[np.ndarray, ...]:
+        """Return frame (-1 for none), number of the view in it, pixel box and score of the best view of voxels."""
+        return tuple(self._column(name)[positions] for name in ("view_frame", "view", "view_box", "view_score"))
+
     def index(self, keys: Int32[np.ndarray, "m 3"]) -> Int64[np.ndarray, " m"]:
         """Return the position of each key, -1 where the map has no such voxel."""
         if not len(self):

@@ -71,7 +71,7 @@ def describe(
         embedding=embedding,
         state=state,
         parent=0,
-        views=tuple(Sighting(c.frame, c.view, c.box) for c in crops),
+        views=tuple(Sighting(c.frame, c.view, c.box, c.score) for c in crops),
         evidence=evidence,
         confidence=confidence,
         heading=heading,

@@ -33,6 +33,7 @@ from openvocab_occ.mapping.layers import MOVABLE, layer_of, moving, standing
 from openvocab_occ.objects import EncoderInfo, KeyFrame, NamedCamera, Provenance, SceneMap
 from openvocab_occ.objects.builder import ObjectBuilder, ObjectConfig
 from openvocab_occ.objects.frame_voxels import gather
+from openvocab_occ.objects.sightings import with_sightings
 from openvocab_occ.occupancy import OCC3D_SPEC, OccupancyGrid
 from openvocab_occ.occupancy.lidar import grid_from_lidar
 from openvocab_occ.segmentation.encoder import FeatureMap, PixelEncoder
@@ -213,7 +214,8 @@ class MapBuilder:
         encoder = EncoderInfo.of(self._encoder)
         voxels, dynamic = self._settled(self._voxels, self._movable)
         assert self._objects is not None, "integrate makes it with the first frame"
-        objects = self._objects.tree(voxels, [frame.T_world_ego for frame in self._frames])
+        tree = self._objects.tree(voxels, [frame.T_world_ego for frame in self._frames])
+        objects = with_sightings(tree, voxels, self._frames)
         options = {"voxel_size": voxels.voxel_size, "max_depth": self._max_depth, "grid_from": self._grid_from,
                    "weights": asdict(self._weights)}  # fmt: skip
         provenance = replace(
