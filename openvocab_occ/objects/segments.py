@@ -37,6 +37,8 @@ class SegmentConfig:
     """The k of the segmentation: a component of n voxels bears edges k / n above its heaviest."""
     class_penalty: float = 0.5
     """Added to the distance of neighbours of which occupancy names different classes; 0 ignores classes."""
+    mask_penalty: float = 0.5
+    """Added to the distance of neighbours in different masks of one view, where a model puts out masks."""
     join: float = 0.75
     """Touching components of one class whose mean features are no further apart than this are one: a wall is one wall
     though its windows differ. Of things that can move any distance will do: cab and box are one truck."""
@@ -55,7 +57,7 @@ class SegmentConfig:
     """Square metres from which a segment at most two voxels high is ground, where no class tells."""
 
     def __post_init__(self) -> None:
-        for name in ("scale", "class_penalty", "join", "cut", "flat_area"):
+        for name in ("scale", "class_penalty", "mask_penalty", "join", "cut", "flat_area"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise ConfigError(f"segment option {name} is not usable", expected=">= 0", got=getattr(self, name))
         if self.min_voxels < 1:
@@ -170,7 +172,8 @@ def _components(
     # what is seen: by features, with classes as evidence
     place = np.cumsum(row >= 0) - 1
     edges = np.ascontiguousarray(row[pairs[shown]])
-    weights = _distances(frame, edges) + config.class_penalty * (named & ~same)[shown]
+    weights = _by_masks(_distances(frame, edges), frame, edges, config.mask_penalty)
+    weights = weights + config.class_penalty * (named & ~same)[shown]
     keep = weights <= config.cut
     edges, weights = np.ascontiguousarray(place[pairs[shown][keep]]), weights[keep]
     seen = np.empty(int((row >= 0).sum()), dtype=np.int64)
@@ -269,6 +272,18 @@ def _joined(
     held = component >= 0
     result[held] = part[np.searchsorted(numbers, component[held])]
     return result
+
+
+def _by_masks(
+    distance: Float32[np.ndarray, " e"], frame: FrameVoxels, edges: Int64[np.ndarray, "e 2"], penalty: float
+) -> Float32[np.ndarray, " e"]:
+    """Return distances that heed masks: none within one, more between two of one view."""
+    if frame.masks is None:
+        return distance
+    a, b = frame.masks[edges].T
+    both = (a >= 0) & (b >= 0)
+    distance = np.where(both & (a == b), np.float32(0), distance)
+    return (distance + np.float32(penalty) * (both & (a != b) & (a >> 16 == b >> 16))).astype(np.float32)
 
 
 def _distances(frame: FrameVoxels, edges: Int64[np.ndarray, "e 2"]) -> Float32[np.ndarray, " e"]:
