@@ -40,16 +40,15 @@ def cut_bridge(packed: Int64[np.ndarray, " n"], name: str, voxel_size: float) ->
     edge = max(round((least - _SLACK) / voxel_size), 1)
     if len(filled) < 2 * edge + 1:
         return [packed]
-    # slices of a turned lattice hold now more, now fewer voxels
-    smooth = np.convolve(np.pad(filled, 1, mode="edge"), np.ones(3) / 3, mode="valid")
-    inner = smooth[edge : len(smooth) - edge]
-    at = edge + int(inner.argmin())
-    peak = min(smooth[:at].max(), smooth[at:].max())
     length = len(filled) * voxel_size
-    valley = VALLEY if length > greatest + _SLACK else GAP
-    if smooth[at] > valley * peak and length <= greatest * TOO_LONG + _SLACK:
+    # slices of a turned lattice hold now more, now fewer voxels, so necks are those of their mean; gaps are clear
+    smooth = np.convolve(np.pad(filled, 1, mode="edge"), np.ones(3) / 3, mode="valid")
+    profile, valley = (smooth, VALLEY) if length > greatest + _SLACK else (filled, GAP)
+    at = edge + int(profile[edge : len(profile) - edge].argmin())
+    peak = min(smooth[:at].max(), smooth[at:].max())
+    if profile[at] > valley * peak and length <= greatest * TOO_LONG + _SLACK:
         return [packed]
-    left = slices < at if smooth[at] > valley * peak else slices <= at
+    left = slices < at if profile[at] > valley * peak else slices <= at
     return [
         piece
         for side in (packed[left], packed[~left])

@@ -206,7 +206,7 @@ def _column_pairs(
         inside = grid.spec.contains(index)
         blind = np.zeros(len(index), dtype=bool)
         blind[inside] = ~grid.known[tuple(index[inside].T)]
-        low = low[blind.reshape(len(low), -1).all(axis=1)]
+        low = low[blind.reshape(len(low), gap - 1).all(axis=1)]
         found.append(np.stack([low, at[low]], axis=1))
     return np.concatenate(found)
 
