@@ -32,7 +32,7 @@ STUFF = ("sky", "road", "sidewalk", "grass")
 Occupancy = Literal["oracle", "perceived"]
 _PERIOD = 0.5  # seconds between keyframes
 _CLASS_OF = {kind: name for name, kinds in CLASSES.items() if name not in STUFF for kind in kinds}
-_ALSO = {"car": ("van",), "wall": ("building", "fence"), "building": ("wall",), "street lamp": ("traffic sign",)}
+ALSO = {"car": ("van",), "wall": ("building", "fence"), "building": ("wall",), "street lamp": ("traffic sign",)}
 """Classes whose things may count as another: a person may call a van a car."""
 
 
@@ -120,7 +120,7 @@ def questions_of(drive: Drive, seed: int, *, synonyms: Mapping[str, str] | None 
         if name in there and word != name and not name.startswith(word):
             wanted = frozenset(thing.id for thing in drive.truth.things if thing.kind == name)
             asked.append(Question(text=word, category="synonym", wanted=wanted))
-    near = {other for name in there for other in _ALSO.get(name, ())}
+    near = {other for name in there for other in ALSO.get(name, ())}
     asked += [
         Question(text=plural(name), category="absent", wanted=frozenset(), verdict="absent")
         for name in sorted(set(CLASSES) - set(STUFF) - there - near)
@@ -135,7 +135,7 @@ def questions_of(drive: Drive, seed: int, *, synonyms: Mapping[str, str] | None 
         if question.category == "state":
             wanted &= drive.watched
         names = {kind[id] for id in question.wanted}
-        also = {other for name in names for other in _ALSO.get(name, ())}
+        also = {other for name in names for other in ALSO.get(name, ())}
         doubt = {t.id for t in drive.truth.things if t.kind in also or (t.kind in names and t.id not in drive.sure)}
         if question.category == "state":
             doubt |= {t.id for t in drive.truth.things if t.kind in names and t.id not in drive.watched}
