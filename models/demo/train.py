@@ -28,11 +28,12 @@ from openvocab_occ.evaluation.words import CLASSES
 HERE = Path(__file__).parent
 CHECKPOINT = HERE / "cache" / "pair.pt"
 BATCH, CROP = 6, (192, 320)
-PIXELS, PHRASES = 2000, 256  # a step
+PIXELS, PHRASES = 5000, 256  # a step
 STRANGERS = 64  # random words a step
 PEAK_RATE, WARM_UP = 3e-3, 300
 RESCAN = 200  # steps between looks for new drives
-SOUGHT = 0.6  # of the crops are around a pixel of a class that is drawn first, so that rare ones are seen
+SOUGHT = (0.6, 0.2)  # share of crops around a pixel of a class that is drawn first, at the start and at the end
+EVEN = (0.5, 0.25)  # how much rare kinds are favoured among pixels: 0 is as they come, which precision wants at the end
 _KEEP = 0.998  # of the running mean of weights
 _CLASS_OF = {kind: number for number, kinds in enumerate(CLASSES.values()) for kind in kinds}
 
@@ -66,9 +67,9 @@ class Drives:
                 self.images += list(drive["images"])
         return bool(new)
 
-    def crop(self, random: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+    def crop(self, random: np.random.Generator, sought_share: float) -> tuple[torch.Tensor, torch.Tensor]:
         """Return a part of a picture, float [3, h, w] in 0..1, and its states, [h / 4, w / 4]."""
-        sought = int(random.choice(list(self._where))) if random.random() < SOUGHT else None
+        sought = int(random.choice(list(self._where))) if random.random() < sought_share else None
         at = int(random.choice(self._where[sought]) if sought is not None else random.integers(len(self.images)))
         image, states = self.images[at], self.numbers[at]
         zoom = random.choice([0.8, 1.0, 1.0, 1.6])
@@ -105,8 +106,9 @@ class Truth:
         count = np.bincount(np.concatenate([n.ravel() for n in drives.numbers]), minlength=len(drives.states))
         kinds = np.unique([s.kind for s in drives.states], return_inverse=True)[1]
         of_kind = np.bincount(kinds, weights=count)[kinds]
-        # rare kinds are seen more often, and within a kind its rare colours and parts a little
-        self.weight = torch.from_numpy((of_kind + 200) ** -0.5 * ((count + 50) / (of_kind + 50)) ** -0.2).float()
+        # within a kind its rare colours and parts are seen a little more often
+        self.of_kind = torch.from_numpy(of_kind + 200.0).float()
+        self.within = torch.from_numpy(((count + 50) / (of_kind + 50)) ** -0.2).float()
         self.classes = torch.tensor([_CLASS_OF.get(s.kind, -1) for s in drives.states], device=device)
         self.names = [torch.tensor(self.phrases.names[name], device=device) for name in CLASSES]
         self.colored = {thing: torch.tensor(rows, device=device) for thing, rows in self.phrases.colored.items()}
@@ -119,15 +121,21 @@ class Truth:
 
 
 def losses(
-    net: Segmenter, head: WordHead, batch: tuple[torch.Tensor, torch.Tensor], truth: Truth, strangers: torch.Tensor
+    net: Segmenter,
+    head: WordHead,
+    batch: tuple[torch.Tensor, torch.Tensor],
+    truth: Truth,
+    strangers: torch.Tensor,
+    even: float,
 ) -> torch.Tensor:
-    """Return the loss of one batch."""
+    """Return the loss of one batch; `even` as EVEN."""
     image, states = batch
+    weight = truth.of_kind**-even * truth.within
     with torch.autocast(image.device.type, torch.bfloat16):
         cells = net(image.contiguous(memory_format=torch.channels_last))
     cells = cells.float().permute(0, 2, 3, 1).reshape(-1, cells.shape[1])
     states = states.reshape(-1)
-    picked = torch.multinomial(truth.weight[states.cpu()], PIXELS).to(image.device)
+    picked = torch.multinomial(weight[states.cpu()], PIXELS).to(image.device)
     cells, states = cells[picked], states[picked]
     texts = head(truth.vectors + 0.05 * truth.vectors.std() * torch.randn_like(truth.vectors))
     asked = torch.randperm(len(texts), device=image.device)[:PHRASES]
@@ -206,9 +214,10 @@ def train(steps: int, device: str) -> None:
         for group in optimizer.param_groups:
             group["lr"] = float(rate)
         net.train()
-        crops = [drives.crop(random) for _ in range(BATCH)]
+        sought, even = (a + (b - a) * step / steps for a, b in (SOUGHT, EVEN))
+        crops = [drives.crop(random, sought) for _ in range(BATCH)]
         batch = (torch.stack([x for x, _ in crops]).to(device), torch.stack([y for _, y in crops]).to(device))
-        loss = losses(net, head, batch, truth, words.strangers(random, STRANGERS).to(device))
+        loss = losses(net, head, batch, truth, words.strangers(random, STRANGERS).to(device), even)
         optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_([*net.parameters(), *head.parameters()], 3.0)
