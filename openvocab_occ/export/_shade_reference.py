@@ -3,7 +3,7 @@
 import numpy as np
 
 
-def shade_reference(rays, position, depth, voxel, centers, colors, sky, shades, haze):  # noqa: ANN001, ANN201
+def shade_reference(rays, position, depth, voxel, centers, colors, sky, shades, haze):  # noqa: ANN001
     """Return the picture that `_shade_kernels.shade` paints."""
     points = np.asarray(position) + depth[..., None].astype(np.float64) * rays
     offset = np.abs(points - centers[voxel])

@@ -42,7 +42,7 @@ def shaded(view: MapView, colors: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray,
 
 
 def relevance_colors(surface: Surface, scores: Mapping[int, float]) -> UInt8[np.ndarray, "n 3"]:
-    """Return colours of voxels: objects with a score from dark (0) to bright (1), all else in its own colour as grey."""
+    """Return colours of voxels: objects with a score from dark (0) to bright (1), all else grey."""
     colors = grey(surface.palette)
     ids = np.array(sorted(scores), np.int64)
     painted = paint_numbers(np.array([scores[int(id)] for id in ids], np.float64), 0.0, 1.0, "plasma")

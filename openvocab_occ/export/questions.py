@@ -1,5 +1,6 @@
 """Questions about a bundle, with answers from the scene graph: what a reader of the pictures should be able to tell."""
 
+import itertools
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -16,8 +17,8 @@ Question = dict[str, Any]
 def questions_about(view: dict[str, Any]) -> list[Question]:
     """Return questions about the content of a view.json, each with its answer; the same view gives the same ones.
 
-    Only what is beyond doubt is asked: states that were observed, sides and distances that clearly differ. `answer` is a
-    whole number, `yes` or `no`, a mark, or one of `choices`; `kind` is count, exists, side, nearest, state or ahead.
+    Only what is beyond doubt is asked: observed states, sides and distances that clearly differ. `answer` is a whole
+    number, `yes` or `no`, a mark, or one of `choices`; `kind` is count, exists, side, nearest, state or ahead.
     """
     marked = sorted((o for o in view["objects"] if o["mark"]), key=lambda o: o["mark"])
     makers: tuple[Callable[[list[dict[str, Any]]], Iterator[Question]], ...] = (
@@ -73,8 +74,8 @@ def _nearest(marked: list[dict[str, Any]]) -> Iterator[Question]:
     for label in _labels(marked):
         same = sorted((o for o in marked if o["label"] == label), key=lambda o: o["range_m"])
         if len(same) > 1 and same[1]["range_m"] - same[0]["range_m"] >= _MARGIN:
-            yield {"kind": "nearest", "question": f'Which marked object labelled "{label}" is nearest to the ego, by its '
-                   "centre? Give its mark.", "answer": same[0]["mark"], "choices": [o["mark"] for o in same],
+            yield {"kind": "nearest", "question": f'Which marked object labelled "{label}" is nearest to the ego, by '
+                   "its centre? Give its mark.", "answer": same[0]["mark"], "choices": [o["mark"] for o in same],
                    "marks": [same[0]["mark"]]}  # fmt: skip
 
 
@@ -86,7 +87,7 @@ def _states(marked: list[dict[str, Any]]) -> Iterator[Question]:
 
 
 def _ahead(marked: list[dict[str, Any]]) -> Iterator[Question]:
-    for one, other in zip(marked, marked[1:], strict=False):
+    for one, other in itertools.pairwise(marked):
         gap = one["center_ego"][0] - other["center_ego"][0]
         if abs(gap) >= 2 * _MARGIN:
             farther = one if gap > 0 else other

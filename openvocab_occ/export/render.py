@@ -71,9 +71,7 @@ class Renderer:
         self.filled = filled
         self._window: _Window | None = None
         keys = self.surface.keys
-        self._bounds = (
-            (keys.min(axis=0).astype(np.int64), keys.max(axis=0).astype(np.int64) + 1) if len(keys) else None
-        )
+        self._bounds = (keys.min(axis=0).astype(np.int64), keys.max(axis=0).astype(np.int64) + 1) if len(keys) else None
 
     def view(self, camera: Camera, max_depth: float = 100.0) -> MapView:
         """Cast a ray through each pixel and find the first voxel within `max_depth`."""

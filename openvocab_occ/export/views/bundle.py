@@ -32,6 +32,7 @@ from openvocab_occ.query.find import find
 MARKER, INDEX = "view.json", "views.json"
 NumberBy = Literal["auto", "relevance", "distance"]
 _FARTHEST = 65535 / DEPTH_SCALE
+_MOST_FIXED = 8  # marks on walls, trees and poles that nobody asked for
 _TEXTS = ("prompt.md", "messages.json", "questions.json")
 
 
@@ -276,7 +277,13 @@ def _order(seen: Sequence[SeenObject], hits: Sequence[int], options: ViewOptions
         moves = kind_of(one.object.label) == Kind.MOVABLE
         return rank.get(one.object.id, len(rank)), -int(moves), -one.pixels
 
-    kept = {one.object.id for one in sorted(large, key=worth)[: options.most_marks]}
+    kept: set[int] = set()
+    fixed = 0
+    for one in sorted(large, key=worth):
+        still = one.object.id not in rank and kind_of(one.object.label) == Kind.FIXED
+        fixed += still
+        if len(kept) < options.most_marks and not (still and fixed > _MOST_FIXED):
+            kept.add(one.object.id)
     chosen = [one for one in large if one.object.id in kept]  # near to far
     if options.number_by == "distance":
         return chosen
@@ -311,4 +318,3 @@ def _write(drawn: _Drawn, folder: Path, options: ViewOptions) -> None:
 
 def _slug(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")[:40] or "view"
-

@@ -5,6 +5,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,8 @@ from openvocab_occ.query.relations import Anchor, Viewpoint, related
 
 SCHEMA = "openvocab_occ.view_bundle"
 VERSION = 2
+MARGIN = (44, 26)
+"""Pixels at the left and at the bottom of the picture from above, for the numbers of its grid."""
 DEPTH_SCALE = 256  # steps a metre of depth.png
 _RELATIONS = ("next to", "in front of", "behind", "left of", "right of")
 _RELATED_WITHIN = 15.0  # metres between centres
@@ -206,10 +209,16 @@ class Contents:
             "x_range": [-extent.behind, extent.ahead],
             "y_range": [-extent.side, extent.side],
             "metres_per_pixel": round(extent.pixel, 6),
+            "margin_left_px": MARGIN[0],
             "grid_m": 10,
             "T_world_bev": numbers(self.overhead.T_world_ego),
             "ceiling_m": CEILING,
         }
+
+
+def schema() -> dict[str, Any]:
+    """Return the JSON Schema (draft 2020-12) that every view.json fits."""
+    return json.loads((Path(__file__).parent / "view.schema.json").read_text(encoding="utf-8"))
 
 
 def bearing_deg(in_ego: Float[np.ndarray, " 3"]) -> float:

@@ -78,7 +78,7 @@ def rig(scene: SceneMap, frame: int, width: int = 1024, height: int = 576) -> li
 def standing_at(
     scene: SceneMap, T_world_ego: Float[np.ndarray, "4 4"], width: int, height: int
 ) -> Lookout:  # fmt: skip
-    """Stand at a pose of the ego with the front camera of the map's rig, or 1.6 m above the ground where it has none."""
+    """Stand at a pose of the ego with the front camera of the map's rig, or 1.6 m up where it has none."""
     frame = next((f for f in scene.frames if f.cameras), None)
     if frame is None:
         camera = pinhole(width, height, _FOV, T_world_ego @ _EYE)

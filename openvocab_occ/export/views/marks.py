@@ -139,7 +139,7 @@ def _lattice(shape: tuple[int, int], width: int, height: int) -> Float64[np.ndar
 
 def _boxes(centers: Float[np.ndarray, "n 2"], width: int, height: int) -> Float64[np.ndarray, "n 4"]:
     corner = np.round(np.asarray(centers, np.float64) - np.array([width, height]) / 2)
-    return np.concatenate([corner, corner + [width - 1, height - 1]], axis=1)
+    return np.concatenate([corner, [*corner, width - 1, height - 1]], axis=1)
 
 
 def _allowed(boxes: Float64[np.ndarray, "n 4"], shape: tuple[int, int], tags: Sequence[Tag]) -> np.ndarray:

@@ -9,16 +9,16 @@ from openvocab_occ.export.draw import SKY, blend, outlines, shaded, to_pixels
 from openvocab_occ.export.overhead import Overhead, wedge
 from openvocab_occ.export.render import MapView
 from openvocab_occ.export.surface import Surface
-from openvocab_occ.export.views.contents import DEPTH_SCALE
+from openvocab_occ.export.views.contents import DEPTH_SCALE, MARGIN
 from openvocab_occ.export.views.marks import BLACK, GOLD, WHITE, Tag, draw_tags, place_tags
 from openvocab_occ.export.views.seen import SeenObject
 from openvocab_occ.geometry import Camera, invert, transform
+from openvocab_occ.objects.kinds import Kind, kind_of
 from openvocab_occ.objects.tree import SceneObject
 
-MARGIN = (44, 26)
-"""Pixels at the left and at the bottom of the picture from above, for the numbers of its grid."""
 _UNKNOWN, _HATCH = (206, 206, 210), (186, 186, 192)
 _CROP_EDGE = 192
+_LARGE = 16.0  # square metres
 
 
 def instance_image(view: MapView, seen: Sequence[SeenObject]) -> UInt16[np.ndarray, "h w"]:
@@ -103,6 +103,8 @@ def marked_overhead(
         cv2.polylines(image, [path], False, (235, 235, 60), 3, cv2.LINE_AA)
     _ego(image, overhead, camera)
     for mark, item in items.items():
+        if mark not in hits and item.box.size[0] * item.box.size[1] > _LARGE and kind_of(item.label) == Kind.FIXED:
+            continue  # the box of a front or a hedge lies over everything else
         corners = np.array(to_pixels(overhead.pixels(item.box.corners[:4])), np.int32)
         cv2.polylines(image, [corners], True, BLACK, 3, cv2.LINE_AA)
         cv2.polylines(image, [corners], True, GOLD if mark in hits else WHITE, 1, cv2.LINE_AA)

@@ -74,8 +74,8 @@ def _pictures(view: dict[str, Any], *, marks: bool, bev: bool) -> str:
         numbered = " and the same marks" if marks else ""
         lines.append(
             f"- `{names[1]}`: the same place from straight above, {-bird['x_range'][0]:.0f} m behind to "
-            f"{bird['x_range'][1]:.0f} m ahead of the ego (black arrow), {bird['y_range'][1]:.0f} m to each side. Up is "
-            f"ahead, left is left: y = 20 is at the left, y = -20 at the right. Grid of 10 m, outlines of the objects"
+            f"{bird['x_range'][1]:.0f} m ahead of the ego (black arrow), {bird['y_range'][1]:.0f} m to each side. Up "
+            f"is ahead, left is left: y = 20 is at the left, y = -20 at the right. Grid of 10 m, outlines of the objects"
             f"{numbered}; what lies higher than {bird['ceiling_m']:.0f} m is left out; hatched ground was never seen."
         )
     if view["provenance"]["synthetic"]:
@@ -93,7 +93,7 @@ def _frame(view: dict[str, Any]) -> str:
 def _legend(view: dict[str, Any]) -> str:
     total = view["camera"]["width"] * view["camera"]["height"]
     rows = [
-        f"- {plain(entry['label'])}: rgb({', '.join(map(str, entry['rgb']))}), {entry['visible_px'] / total:.1%} of the view"
+        f"- {plain(entry['label'])}: rgb{tuple(entry['rgb'])}, {entry['visible_px'] / total:.1%} of the view"
         for entry in view["legend"][:24]
     ]
     if not rows:
@@ -152,7 +152,9 @@ def _query(view: dict[str, Any]) -> str:
     query = view["query"]
     if query is None:
         return ""
-    lines = [f'## Query\n\nThe map was asked for "{plain(query["text"])}": {query["verdict"]}, {query["count"]} in all.']
+    lines = [
+        f'## Query\n\nThe map was asked for "{plain(query["text"])}": {query["verdict"]}, {query["count"]} in all.'
+    ]
     shown = [hit for hit in query["hits"] if hit["mark"]]
     if shown:
         lines.append("Here: " + ", ".join(f"mark {hit['mark']} (score {hit['score']:.2f})" for hit in shown) + ".")

@@ -109,8 +109,10 @@ def _frame(
 
 
 def amodal_box(camera: Camera, item: SceneObject) -> list[int] | None:
-    """Return the pixels that an object's upright box takes up, cut at the picture's border; None where none, or where
-    it reaches behind the camera."""
+    """Return the pixels that an object's upright box takes up, cut at the picture's border.
+
+    None where there are none, or where it reaches behind the camera.
+    """
     pixels, depth = camera.project(item.box.corners)
     if (depth <= 0.05).any() or not np.isfinite(pixels).all():
         return None
