@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int32
+from jaxtyping import Bool, Float, Float64, Int32, Int64
 
 from openvocab_occ.export.surface import Surface
 from openvocab_occ.geometry import invert, transform
@@ -79,15 +79,21 @@ def render_overhead(
     seen = _seen(scene, places)
     cells = np.floor(places / surface.voxel_size).astype(np.int64)
     low, high = cells.reshape(-1, 2).min(axis=0), cells.reshape(-1, 2).max(axis=0) + 1
-    rows = surface.upwards
-    keys = surface.keys[rows]
-    top = np.floor((ground + CEILING) / surface.voxel_size)
-    inside = ((keys[:, :2] >= low) & (keys[:, :2] < high)).all(axis=1) & (keys[:, 2] < top)
+    rows = _column_rows(surface, low, high, int(np.floor((ground + CEILING) / surface.voxel_size)))
     table = np.full(tuple(high - low), -1, np.int32)
-    table[tuple((keys[inside, :2] - low).T)] = rows[inside]  # the highest is written last
+    table[tuple((surface.keys[rows, :2] - low).T)] = rows  # the highest is written last
     voxel = table[tuple(np.moveaxis(cells - low, -1, 0))]
     item = np.append(surface.item, np.int32(0))[voxel]
     return Overhead(extent, flat, voxel, item, seen | (voxel >= 0))
+
+
+def _column_rows(
+    surface: Surface, low: Int64[np.ndarray, " 2"], high: Int64[np.ndarray, " 2"], top: int
+) -> Int64[np.ndarray, " n"]:
+    """Return the rows of the voxels over a rectangle and below a height, the lowest first."""
+    x, y, z = surface.keys.T
+    rows = np.flatnonzero((x >= low[0]) & (x < high[0]) & (y >= low[1]) & (y < high[1]) & (z < top))
+    return rows[np.argsort(z[rows], kind="stable")]
 
 
 def _seen(scene: SceneMap, places: Float[np.ndarray, "h w 2"]) -> Bool[np.ndarray, "h w"]:

@@ -48,11 +48,6 @@ class Surface:
         return table[self.label]
 
     @cached_property
-    def upwards(self) -> Int64[np.ndarray, " n"]:
-        """Rows from the lowest voxel to the highest."""
-        return np.argsort(self.keys[:, 2], kind="stable")
-
-    @cached_property
     def rows_by_item(self) -> dict[int, Int64[np.ndarray, " _"]]:
         """Rows of each object, as far as they are its own."""
         order = np.argsort(self.item, kind="stable")

@@ -133,6 +133,18 @@ def export_views(
     height: int = ...,
     options: ViewOptions | None = ...,
 ) -> list[ViewBundle]: ...
+@overload
+def export_views(
+    scene: SceneMap,
+    out: PathLike,
+    *,
+    viewpoints: Camera | Lookout | Sequence[Camera | Lookout] | None = ...,
+    route: Route | None = ...,
+    query: Answer | str | None = ...,
+    width: int = ...,
+    height: int = ...,
+    options: ViewOptions | None = ...,
+) -> ViewBundle | list[ViewBundle]: ...
 def export_views(
     scene: SceneMap,
     out: PathLike,

@@ -139,7 +139,7 @@ def _lattice(shape: tuple[int, int], width: int, height: int) -> Float64[np.ndar
 
 def _boxes(centers: Float[np.ndarray, "n 2"], width: int, height: int) -> Float64[np.ndarray, "n 4"]:
     corner = np.round(np.asarray(centers, np.float64) - np.array([width, height]) / 2)
-    return np.concatenate([corner, [*corner, width - 1, height - 1]], axis=1)
+    return np.concatenate([corner, corner + np.array([width - 1, height - 1])], axis=1)
 
 
 def _allowed(boxes: Float64[np.ndarray, "n 4"], shape: tuple[int, int], tags: Sequence[Tag]) -> np.ndarray:
@@ -163,16 +163,16 @@ def _costs(
     area = total[d + 1, c + 1] - total[b, c + 1] - total[d + 1, a] + total[b, a]
     cost += _COVER * area / ((c - a + 1) * (d - b + 1))
     for point in others:
-        cost += _ANCHOR * _within(point[None], boxes, 4)
+        cost += _ANCHOR * _within(point[None], boxes, 4.0)
     along = np.linspace(0, 1, 24)[:, None, None]
     path = here + along * (centers - here)  # samples x places x 2
     for tag in tags:
         box = np.array(tag.box, np.float64)
-        cost += _CROSS * np.any(_within(path, box[None], 2), axis=0)
+        cost += _CROSS * np.any(_within(path, box[None], 2.0), axis=0)
         if tag.leader:
             middle = (box[:2] + box[2:]) / 2
             theirs = np.array(tag.anchor) + np.linspace(0, 1, 24)[:, None] * (middle - np.array(tag.anchor))
-            cost += _CROSS * np.any([_within(point[None], boxes, 2) for point in theirs], axis=0)
+            cost += _CROSS * np.any([_within(point[None], boxes, 2.0) for point in theirs], axis=0)
             cost += _CROSS / 2 * _crossing(here, centers, np.array(tag.anchor), middle)
     return cost
 

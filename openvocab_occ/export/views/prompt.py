@@ -74,9 +74,10 @@ def _pictures(view: dict[str, Any], *, marks: bool, bev: bool) -> str:
         numbered = " and the same marks" if marks else ""
         lines.append(
             f"- `{names[1]}`: the same place from straight above, {-bird['x_range'][0]:.0f} m behind to "
-            f"{bird['x_range'][1]:.0f} m ahead of the ego (black arrow), {bird['y_range'][1]:.0f} m to each side. Up "
-            f"is ahead, left is left: y = 20 is at the left, y = -20 at the right. Grid of 10 m, outlines of the objects"
-            f"{numbered}; what lies higher than {bird['ceiling_m']:.0f} m is left out; hatched ground was never seen."
+            f"{bird['x_range'][1]:.0f} m ahead of the ego (black arrow), {bird['y_range'][1]:.0f} m to each side. "
+            f"Up is ahead, left is left: y = 20 is at the left, y = -20 at the right. Grid of 10 m, outlines of the "
+            f"objects{numbered}; what lies higher than {bird['ceiling_m']:.0f} m is left out; hatched ground was never "
+            f"seen."
         )
     if view["provenance"]["synthetic"]:
         lines.append("\nThe street is synthetic.")
