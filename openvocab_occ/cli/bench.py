@@ -175,6 +175,6 @@ def views(
         f"{times.threads} threads, {machine}\n"
     )
     table = Table("picture", "seconds", box=None, pad_edge=False)
-    for name in ("first", "ids", "palette", "shaded", "panorama", "overhead"):
+    for name in ("first", "ids", "cpu_ids", "cpu_shaded", "palette", "shaded", "panorama", "overhead"):
         table.add_row(name, f"{getattr(times, name):.3f}")
     out.print(table)

@@ -34,6 +34,10 @@ class ViewTimes:
     """The first view, which makes the grid and its faces."""
     ids: float
     """Voxel, object and z-depth of each pixel."""
+    cpu_ids: float
+    """The same in seconds of CPU, all threads: what does not depend on what else the machine does."""
+    cpu_shaded: float
+    """As `shaded`, in seconds of CPU."""
     palette: float
     """`ids`, and the exact picture of labels."""
     shaded: float
@@ -66,15 +70,26 @@ def time_views(
         def median(work: Callable[[int], object]) -> float:
             return statistics.median(_seconds(lambda k=k: work(k)) for k in range(rounds))
 
+        def median_cpu(work: Callable[[int], object]) -> float:
+            return statistics.median(_cpu_seconds(lambda k=k: work(k)) for k in range(rounds))
+
         palette = renderer.surface.palette
         return ViewTimes(
             voxels=len(renderer.surface), faces=faces, width=width, height=height, threads=num_threads(), first=first,
             ids=median(lambda k: renderer.view(cameras[k])),
+            cpu_ids=median_cpu(lambda k: renderer.view(cameras[k])),
+            cpu_shaded=median_cpu(lambda k: shaded(renderer.view(cameras[k]), palette)),
             palette=median(lambda k: paint(renderer.view(cameras[k]), palette)),
             shaded=median(lambda k: shaded(renderer.view(cameras[k]), palette)),
             panorama=median(lambda k: renderer.panorama(cameras[k].position, width=1024)),
             overhead=median(lambda _: render_overhead(scene, renderer.surface, T, Extent(90, 10, 50, 0.1), ground=0.0)),
         )  # fmt: skip
+
+
+def _cpu_seconds(work: Callable[[], object]) -> float:
+    started = time.process_time()
+    work()
+    return time.process_time() - started
 
 
 def _seconds(work: Callable[[], object]) -> float:

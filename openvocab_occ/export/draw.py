@@ -10,6 +10,7 @@ from openvocab_occ.export._shade_kernels import shade
 from openvocab_occ.export.palette import NOTHING, grey, paint_numbers
 from openvocab_occ.export.render import MapView
 from openvocab_occ.export.surface import Surface
+from openvocab_occ.geometry import Camera
 
 SKY = (226, 234, 242)
 """Where pictures for people show nothing."""
@@ -29,7 +30,7 @@ def shaded(view: MapView, colors: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray,
     """Draw voxels with shaded faces, paler in the distance."""
     camera, surface = view.camera, view.surface
     out = np.empty((*view.voxel.shape, 3), np.uint8)
-    rays = camera.rays() @ camera.T_world_cam[:3, :3].T
+    rays = _world_rays(camera)
     centers, sky = surface.centers32, np.array(SKY, np.float64)
 
     def rows(start: int, stop: int) -> None:
@@ -39,6 +40,19 @@ def shaded(view: MapView, colors: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray,
 
     in_slices(rows, len(out), grain=16)
     return out
+
+
+def _world_rays(camera: Camera) -> Float[np.ndarray, "h w 3"]:
+    """Return the rays of `camera.rays()` along world axes; those of a pinhole are affine in the pixel."""
+    R = camera.T_world_cam[:3, :3]
+    if camera.lens != "pinhole":
+        return camera.rays() @ R.T
+    M = R @ np.linalg.inv(camera.K)
+    rays = np.empty((camera.height, camera.width, 3))
+    v, u = np.arange(camera.height)[:, None], np.arange(camera.width)
+    for axis in range(3):
+        rays[..., axis] = M[axis, 0] * u + (M[axis, 1] * v + M[axis, 2])
+    return rays
 
 
 def relevance_colors(surface: Surface, scores: Mapping[int, float]) -> UInt8[np.ndarray, "n 3"]:

@@ -140,10 +140,10 @@ def _grid(image: UInt8[np.ndarray, "h w 3"], overhead: Overhead) -> None:
     extent = overhead.extent
     for x in np.arange(-extent.behind + 10, extent.ahead, 10):
         row = round((extent.ahead - x) / extent.pixel)
-        blend(image, _line(image.shape, row, 0, x == 0), BLACK, 0.30)
+        blend(image, _line(image.shape, row, 0, bool(x == 0)), BLACK, 0.30)
     for y in np.arange(-extent.side + 10, extent.side, 10):
         column = round((extent.side - y) / extent.pixel)
-        blend(image, _line(image.shape, column, 1, y == 0), BLACK, 0.30)
+        blend(image, _line(image.shape, column, 1, bool(y == 0)), BLACK, 0.30)
 
 
 def _line(shape: tuple[int, ...], at: int, axis: int, bold: bool) -> Bool[np.ndarray, "h w"]:
