@@ -71,7 +71,7 @@ def load_nuscenes(
         root: The folder that holds `v1.0-*`, `samples` and perhaps `gts`.
         scene: Name or token.
         version: Such as `v1.0-mini`, where the root holds several.
-        split: `train`, `val` or `test` by Occ3D's `annotations.json`; v1.0-mini needs none.
+        split: `train`, `val` or `test`: by Occ3D's `annotations.json` where it is, else the official ones.
         cameras: Channels to read, in this order; all of them by default.
         lidar: Read the sweeps.
         labels: Read Occ3D's labels.

@@ -13,7 +13,11 @@ import msgspec
 from openvocab_occ.errors import ConfigError, DataError, NotFoundError
 from openvocab_occ.io.files import existing
 
-MINI_VAL = ("scene-0103", "scene-0916")
+_VAL = (
+    "3 12-18 35-36 38-39 92-110 221 268-278 329-332 344-346 519-524 552-565 625-627 629-630 632-638 770-771 775 "
+    "777-778 780-784 794-800 802 904-917 919-931 962-963 966-969 971-972 1059-1073"
+)  # scene numbers of the official validation split; of v1.0-mini, 103 and 916 are in it, and it names them alone
+_MINI_VAL = "103 916"
 """The validation scenes of v1.0-mini; its other eight are for training."""
 
 
@@ -117,7 +121,7 @@ def read_rows(tables: Path, name: str, row: type[_Row], keep: Callable[[Any], bo
 
 
 def scene_names_of(root: Path, tables: Path, split: str) -> frozenset[str]:
-    """Return the scenes of a split: from Occ3D's `annotations.json`, or those of v1.0-mini, which are known."""
+    """Return the scenes of a split: from Occ3D's `annotations.json` where it is, else the official ones."""
     file = root / "annotations.json"
     if file.is_file():
         try:
@@ -128,11 +132,20 @@ def scene_names_of(root: Path, tables: Path, split: str) -> frozenset[str]:
             return frozenset(lists[f"{split}_split"])
         names = [key.removesuffix("_split") for key in lists if key.endswith("_split")]
         raise ConfigError(f"{file.name} has no split {split!r}", expected=" or ".join(names) or "none: it lists none")
-    if tables.name == "v1.0-mini" and split in ("train", "val"):
-        names = [scene.name for scene in read_rows(tables, "scene", SceneRow)]
-        return frozenset(name for name in names if (name in MINI_VAL) == (split == "val"))
+    names = [scene.name for scene in read_rows(tables, "scene", SceneRow)]
+    val = _scene_names(_MINI_VAL if tables.name == "v1.0-mini" else _VAL)
+    if split in ("train", "val") and tables.name != "v1.0-test":
+        return frozenset(name for name in names if (name in val) == (split == "val"))
+    if split == "test" and tables.name == "v1.0-test":
+        return frozenset(names)
     raise ConfigError(
-        f"scenes of split {split!r} are not known",
-        expected=f"the lists of Occ3D's {file}",
-        fix="put annotations.json there, or name a scene",
+        f"{tables.name} has no split {split!r}",
+        expected="test" if tables.name == "v1.0-test" else "train or val",
+        fix=f"put Occ3D's {file.name} into {root}, or name a scene",
     )
+
+
+def _scene_names(numbers: str) -> frozenset[str]:
+    """Turn numbers and ranges, such as `3 12-18`, into names of scenes."""
+    ranges = [(int(part.split("-")[0]), int(part.split("-")[-1])) for part in numbers.split()]
+    return frozenset(f"scene-{n:04d}" for first, last in ranges for n in range(first, last + 1))

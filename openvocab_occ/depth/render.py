@@ -17,6 +17,7 @@ from openvocab_occ.geometry import Camera
 from openvocab_occ.occupancy import OccupancyGrid
 from openvocab_occ.occupancy.pixel_rays import PixelRays
 from openvocab_occ.occupancy.rays import lattice_rays, trace_lattice
+from openvocab_occ.occupancy.tensor_rays import trace_on
 
 _GRAIN = 2048  # rays worth a thread
 
@@ -27,7 +28,13 @@ _Pixels = Int[np.ndarray, " pixels"]
 
 @overload
 def render_depth(
-    grid: OccupancyGrid, camera: Camera, *, max_depth: float = ..., step: float | None = ..., surface: Surface = ...
+    grid: OccupancyGrid,
+    camera: Camera,
+    *,
+    max_depth: float = ...,
+    step: float | None = ...,
+    surface: Surface = ...,
+    device: str | None = ...,
 ) -> DepthImage: ...
 @overload
 def render_depth(
@@ -37,6 +44,7 @@ def render_depth(
     max_depth: float = ...,
     step: float | None = ...,
     surface: Surface = ...,
+    device: str | None = ...,
 ) -> list[DepthImage]: ...
 def render_depth(
     grid: OccupancyGrid,
@@ -45,6 +53,7 @@ def render_depth(
     max_depth: float = 100.0,
     step: float | None = None,
     surface: Surface = "voxel",
+    device: str | None = None,
 ) -> DepthImage | list[DepthImage]:
     """Render the z-depth of the first occupied voxel in each pixel; several cameras give a list.
 
@@ -61,6 +70,8 @@ def render_depth(
         surface: `voxel`: the faces of voxels, a staircase. `smooth`: where `grid.probability`, trilinear between the
             centres of voxels, first reaches 0.5 (0 where the camera is above it); the voxel is the one of the eight
             around the point that adds most to it. It has logits to go by, or else smoothed labels.
+        device: A GPU, as torch names it (`cuda`, `cuda:1`), where exact depth of voxels is walked by Triton and from
+            where it is copied back; the same voxels as by the processor but for rays within rounding of an edge.
     """
     _check_length(max_depth, "max_depth")
     if step is not None:
@@ -69,8 +80,12 @@ def render_depth(
         raise ConfigError("surface is not known", expected=" or ".join(get_args(Surface)), got=surface)
     if surface == "smooth" and step is not None:
         raise ConfigError("a smooth surface is not sampled", expected="step=None", got=step)
+    if device is not None and (surface == "smooth" or step is not None):
+        raise ConfigError("a GPU renders exact depth of voxels only", expected='surface="voxel", step=None', got=device)
     cameras = [camera] if isinstance(camera, Camera) else list(camera)
-    if surface == "smooth":
+    if device is not None:
+        images = [_walked_on(device, grid, one, float(max_depth)) for one in cameras]
+    elif surface == "smooth":
         images = [_smooth(grid, one, float(max_depth)) for one in cameras]
     elif step is None:
         images = [image for image, _ in _exact(grid, cameras, float(max_depth))]
@@ -107,6 +122,13 @@ def _rays(grid: OccupancyGrid, camera: Camera) -> tuple[Float[np.ndarray, "1 3"]
         return view.origin[None], view.directions(np.arange(camera.height * camera.width))
     rays = camera.rays().reshape(-1, 3) @ camera.T_world_cam[:3, :3].T
     return lattice_rays(grid, camera.position[None], rays)
+
+
+def _walked_on(device: str, grid: OccupancyGrid, camera: Camera, max_depth: float) -> DepthImage:
+    rays = PixelRays.of(camera, grid) if camera.lens == "pinhole" else _rays(grid, camera)
+    depth, voxel = trace_on(device, grid, rays, max_depth)
+    size = (camera.height, camera.width)
+    return DepthImage(depth.reshape(size), voxel.reshape(size))
 
 
 def _smooth(grid: OccupancyGrid, camera: Camera, max_depth: float) -> DepthImage:

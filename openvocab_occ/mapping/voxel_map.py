@@ -47,21 +47,16 @@ class VoxelMap:
         self.dim = int(dim)
         self.contract: Contract = contract
         self.num_classes = int(num_classes)
-        self.free = FreeSpace(self.voxel_size)
-        """Where cameras looked through; `integrate` does not touch it."""
+        self._free: FreeSpace | Callable[[], FreeSpace] = FreeSpace(self.voxel_size)
         self._table = KeyTable()  # rows in order of arrival
         self._records = Records(self.num_classes)
         self._sums = FeatureSums(self.dim)
         self._cache: dict[str, np.ndarray] = {}
         self._load: Callable[[str], np.ndarray] | None = None  # where columns come from until the map grows
+        self._stored = 0  # how many voxels that holds
 
     def __len__(self) -> int:
-        return len(self._packed)
-
-    @property
-    def num_stored(self) -> int:
-        """Voxels, told without sorting them: cheap while the map grows."""
-        return len(self) if self._load else len(self._table)
+        return self._stored if self._load else len(self._table)
 
     def __repr__(self) -> str:
         return f"VoxelMap({len(self)} voxels of {self.voxel_size} m, {self.dim} {self.contract} channels)"
@@ -70,6 +65,17 @@ class VoxelMap:
     def keys(self) -> Int32[np.ndarray, "n 3"]:
         """Lattice indices, sorted by x, then y, then z."""
         return self._cached("keys", lambda: unpack(self._packed), always=True)
+
+    @property
+    def free(self) -> FreeSpace:
+        """Where cameras looked through; `integrate` does not touch it."""
+        if not isinstance(self._free, FreeSpace):
+            self._free = self._free()
+        return self._free
+
+    @free.setter
+    def free(self, space: FreeSpace) -> None:
+        self._free = space
 
     @property
     def centers(self) -> Float64[np.ndarray, "n 3"]:
@@ -331,21 +337,24 @@ class VoxelMap:
         cls,
         voxel_size: float,
         dim: int,
-        packed: Int64[np.ndarray, " n"],
+        count: int,
         load: Callable[[str], np.ndarray],
         *,
+        free: Callable[[], FreeSpace],
         contract: Contract,
         num_classes: int = 0,
     ) -> "VoxelMap":
-        """Return a map whose columns are read when they are asked for, by `load(name)`; `packed` keys are sorted."""
+        """Return a map of `count` voxels that are read when they are asked for, and so is what was seen through.
+
+        `load("packed")` gives the packed keys, sorted, and `load` of another name that column.
+        """
         voxels = cls(voxel_size, dim, contract=contract, num_classes=num_classes)
-        voxels._cache["packed"] = packed
-        voxels._load = load
+        voxels._stored, voxels._load, voxels._free = count, load, free
         return voxels
 
     @property
     def _packed(self) -> Int64[np.ndarray, " n"]:
-        return self._cached("packed", lambda: np.sort(self._table.keys), always=True)
+        return self._cached("packed", lambda: np.sort(self._table.keys))
 
     @property
     def _order(self) -> Int64[np.ndarray, " n"]:

@@ -122,8 +122,9 @@ def _merge(
         one.absorb(two)
         del kept[b]
         into[b] = a
-        barred[a] |= barred[b]
-        for other in barred[b]:
+        others = barred.pop(b, set()) - {a, b}  # what stands may merge with what it was seen apart from
+        barred[a] = (barred[a] - {b}) | others
+        for other in others:
             barred[other].add(a)
     return {id: home(id) for id in into}
 

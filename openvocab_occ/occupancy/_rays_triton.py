@@ -113,3 +113,16 @@ def first_hits(
             shared=len(origins) == 1, rays=_RAYS,
         )  # fmt: skip
     return t, voxel
+
+
+@no_type_check
+def pixel_rays(
+    lens: list[float], R: list[list[float]], size: tuple[int, int], device: "torch.device"
+) -> "torch.Tensor":
+    """Return the rays of all pixels of a `PixelRays`, f64[pixels, 3], by its formula."""
+    fx, skew, cx, fy, cy = lens
+    v = torch.arange(size[0], dtype=torch.float64, device=device)[:, None]
+    u = torch.arange(size[1], dtype=torch.float64, device=device)[None]
+    y = (v - cy) / fy
+    x = ((u - cx) - skew * y) / fx
+    return torch.stack([(a * x + b * y) + c for a, b, c in R], dim=2).reshape(-1, 3)

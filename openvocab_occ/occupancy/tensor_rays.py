@@ -5,12 +5,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float32, Int32
 
-from openvocab_occ.errors import DataError, MissingExtraError, ShapeError
+from openvocab_occ.errors import ConfigError, DataError, MissingExtraError, ShapeError
 from openvocab_occ.geometry import invert
 
 if TYPE_CHECKING:
     from openvocab_occ.occupancy.grid import OccupancyGrid
+    from openvocab_occ.occupancy.pixel_rays import PixelRays
 
 
 @runtime_checkable
@@ -64,10 +66,45 @@ def cast_tensors(grid: "OccupancyGrid", origins: Any, directions: Any, max_range
     Raises:
         MissingExtraError: Triton is not installed; it comes with torch's builds for GPUs.
     """
+    return TensorHits(*_walk(grid, *lattice_tensors(grid, origins, directions), max_range))
+
+
+def trace_on(
+    device: str, grid: "OccupancyGrid", rays: "PixelRays | tuple[np.ndarray, np.ndarray]", t_max: float
+) -> tuple[Float32[np.ndarray, " n"], Int32[np.ndarray, " n"]]:
+    """Do as `rays.trace_lattice` on a device, for rays of a pinhole camera or any that are in units of voxels.
+
+    Raises:
+        ConfigError: There is no such device.
+        MissingExtraError: Triton is not installed.
+    """
+    triton = _triton()
+    try:
+        place = triton.torch.empty(0, device=device).device
+    except (RuntimeError, AssertionError) as error:
+        raise ConfigError(
+            "torch cannot use this device", expected="a GPU and a build of torch for it", got=device, fix="leave it out"
+        ) from error
+    if isinstance(rays, tuple):
+        starts, steps = (triton.torch.from_numpy(a).to(place) for a in rays)
+    else:
+        starts = triton.torch.from_numpy(rays.origin[None]).to(place)
+        steps = triton.pixel_rays(rays.lens.tolist(), rays.R.tolist(), rays.size, place)
+    t, voxel = _walk(grid, starts, steps, t_max)
+    return t.cpu().numpy(), voxel.cpu().numpy()
+
+
+def _walk(grid: "OccupancyGrid", starts: Any, steps: Any, t_max: float) -> tuple[Any, Any]:
+    triton = _triton()
+    occupied = starts.new_tensor(grid.occupied.view(np.uint8), dtype=triton.torch.uint8)
+    return triton.first_hits(starts, steps, occupied, t_max)
+
+
+def _triton() -> Any:
     try:
         from openvocab_occ.occupancy import _rays_triton
     except ImportError as error:
-        raise MissingExtraError("Triton is not installed", fix="pip install triton, or pass rays on the CPU") from error
-    starts, steps = lattice_tensors(grid, origins, directions)
-    occupied = starts.new_tensor(grid.occupied.view(np.uint8), dtype=_rays_triton.torch.uint8)
-    return TensorHits(*_rays_triton.first_hits(starts, steps, occupied, max_range))
+        raise MissingExtraError(
+            "Triton is not installed", fix="pip install triton, or stay on the processor"
+        ) from error
+    return _rays_triton

@@ -117,6 +117,16 @@ def test_a_known_point_falls_on_its_pixel(tree):
         assert frame.timestamp == pytest.approx(1_000_000_010 + 0.5 * i)
 
 
+def test_official_splits(tree):
+    scenes = tree / "v1.0-mini" / "scene.json"
+    scenes.write_text(scenes.read_text().replace("scene-0002", "scene-1073"))
+    (tree / "v1.0-mini").rename(tree / "v1.0-trainval")
+    assert {f.token[:10] for f in load_sequence("nuscenes", tree, split="train")} == {"scene-0001"}
+    assert len(load_sequence("nuscenes", tree, split="val")) == 3
+    (tree / "v1.0-trainval").rename(tree / "v1.0-test")
+    assert len(load_sequence("nuscenes", tree, split="test")) == 6
+
+
 def test_scenes_splits_and_versions(tree):
     assert len(load_sequence("nuscenes", tree)) == 6
     assert load_sequence("nuscenes", tree, scene="t0").name == "scene-0001"
@@ -124,6 +134,8 @@ def test_scenes_splits_and_versions(tree):
         load_sequence("nuscenes", tree, scene="scene-9")
     assert len(load_sequence("nuscenes", tree, split="train")) == 6  # of v1.0-mini, all but two scenes
     assert len(load_sequence("nuscenes", tree, split="val")) == 0
+    with pytest.raises(ConfigError, match="v1.0-mini has no split 'test': expected train or val"):
+        load_sequence("nuscenes", tree, split="test")
     (tree / "annotations.json").write_text(json.dumps({"train_split": ["scene-0001"], "val_split": ["scene-0002"]}))
     assert [f.token for f in load_sequence("nuscenes", tree, split="val")] == [f"scene-0002-{i}" for i in range(3)]
     with pytest.raises(ConfigError, match="has no split 'test': expected train or val"):

@@ -12,8 +12,9 @@ import pytest
 import torch
 
 import openvocab_occ
-from openvocab_occ.errors import DataError, ShapeError
-from openvocab_occ.geometry import GridSpec, pose
+from openvocab_occ.depth import render_depth
+from openvocab_occ.errors import ConfigError, DataError, ShapeError
+from openvocab_occ.geometry import Camera, GridSpec, pose
 from openvocab_occ.occupancy import GEOMETRY_CLASSES, OccupancyGrid, cast_rays
 
 HERE = Path(__file__).parent
@@ -91,3 +92,24 @@ def test_tensors_and_arrays_meet_in_the_same_lattice(scene):
     wanted = lattice_rays(grid, origins, units)
     np.testing.assert_allclose(starts.numpy(), wanted[0], atol=1e-12)
     np.testing.assert_allclose(steps.numpy(), wanted[1], atol=1e-12)
+
+
+@pytest.mark.gpu
+@needs_triton
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+def test_depth_is_walked_on_a_gpu(scene):
+    grid = scene[0]
+    camera = Camera(np.array([[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]]), 64, 48, grid.T_world_grid)
+    wanted, found = render_depth(grid, camera), render_depth(grid, camera, device="cuda")
+    assert (found.voxel == wanted.voxel).mean() > 0.999
+    np.testing.assert_allclose(np.median(np.abs(found.depth - wanted.depth)), 0, atol=1e-5)
+
+
+def test_what_a_gpu_cannot_render_is_said(scene):
+    grid = scene[0]
+    camera = Camera(np.eye(3), 4, 4)
+    with pytest.raises(ConfigError, match=r"a GPU renders exact depth of voxels only: .*got cuda"):
+        render_depth(grid, camera, step=0.1, device="cuda")
+    if not torch.cuda.is_available():
+        with pytest.raises(ConfigError, match="torch cannot use this device: .*got cuda"):
+            render_depth(grid, camera, device="cuda")

@@ -1,4 +1,6 @@
-"""Run the Triton kernel and the walk on the families of rays of test_rays; print how many hits and differences."""
+"""Run the Triton kernel and the walk on the families of rays of test_rays, and render depth of a pinhole and a fisheye
+camera both ways; print how many hits and differences.
+"""
 
 import json
 import warnings
@@ -7,7 +9,9 @@ import numpy as np
 import torch
 from test_rays import FAMILIES
 
-from openvocab_occ.occupancy import _rays_kernels, _rays_triton
+from openvocab_occ.depth import render_depth
+from openvocab_occ.geometry import Camera, GridSpec, pose
+from openvocab_occ.occupancy import GEOMETRY_CLASSES, OccupancyGrid, _rays_kernels, _rays_triton
 
 
 def main() -> None:
@@ -33,6 +37,18 @@ def main() -> None:
                 )
                 hits[name] += int((voxel >= 0).sum())
                 different[name] += int(((found[0].numpy() != t) | (found[1].numpy() != voxel)).sum())
+    grid = OccupancyGrid(
+        (random.random((12, 10, 6)) < 0.9).astype(np.uint8), GridSpec((-2.4, -2.0, -1.0), (0.4, 0.4, 0.3), (12, 10, 6)),
+        pose([5.0, 1.0, 0.5], [0.9, 0.1, -0.3, 0.2]), 1, class_names=GEOMETRY_CLASSES,
+    )  # fmt: skip
+    for lens in ("pinhole", "fisheye"):
+        K = np.array([[9.0, 0.4 * (lens == "pinhole"), 7.3], [0.0, 8.0, 5.1], [0.0, 0.0, 1.0]])
+        bend = () if lens == "pinhole" else (0.1, -0.02, 0.0, 0.0)
+        camera = Camera(K, 16, 11, pose([5.1, 0.9, 0.4], [0.5, -0.5, 0.5, -0.5]), bend, lens)
+        wanted = render_depth(grid, camera, max_depth=4.0)
+        found = render_depth(grid, camera, max_depth=4.0, device="cpu")
+        hits[lens] = int((wanted.voxel >= 0).sum())
+        different[lens] = int(((found.depth != wanted.depth) | (found.voxel != wanted.voxel)).sum())
     print(json.dumps({"hits": hits, "different": different}))
 
 
