@@ -76,8 +76,8 @@ def _pictures(view: dict[str, Any], *, marks: bool, bev: bool) -> str:
             f"- `{names[1]}`: the same place from straight above, {-bird['x_range'][0]:.0f} m behind to "
             f"{bird['x_range'][1]:.0f} m ahead of the ego (black arrow), {bird['y_range'][1]:.0f} m to each side. "
             f"Up is ahead, left is left: y = 20 is at the left, y = -20 at the right. Grid of 10 m, outlines of the "
-            f"objects{numbered}; what lies higher than {bird['ceiling_m']:.0f} m is left out; hatched ground was never "
-            f"seen."
+            f"objects{numbered}; what lies higher than {bird['ceiling_m']:.0f} m is left out; pale ground is empty, "
+            f"hatched ground was never seen."
         )
     if view["provenance"]["synthetic"]:
         lines.append("\nThe street is synthetic.")
