@@ -138,6 +138,7 @@ def mcp(
     card: Path | None = None,
     other: Path | None = None,
     out: Path | None = None,
+    json: bool = False,
 ) -> None:
     """Serve a map to agents over the Model Context Protocol, on standard input and output.
 
@@ -147,10 +148,15 @@ def mcp(
         card: The model's card, if it does not lie beside it.
         other: A second map of the same place, that `diff` may compare with.
         out: Folder for pictures; a temporary one by default.
+        json: Print the tools with the schemas of their arguments as one JSON object, and serve nothing.
     """
-    from openvocab_occ.export.mcp_server import MapTools, server
+    from openvocab_occ.export.mcp_server import MapTools, described, server
     from openvocab_occ.segmentation.onnx import load_encoder
 
     model = load_encoder(encoder, card) if encoder else None
     maps = {"map": map} | ({"other": other} if other else {})
-    server(MapTools(maps, model, out)).run("stdio")
+    made = server(MapTools(maps, model, out))
+    if json:
+        print_json({"tools": described(made)})
+    else:
+        made.run("stdio")

@@ -192,5 +192,13 @@ def server(tools: MapTools) -> "MCPServer":
     return made
 
 
+def described(made: "MCPServer") -> list[dict[str, Any]]:
+    """Return name, text and JSON Schema of the arguments of each tool."""
+    import asyncio
+
+    tools = asyncio.run(made.list_tools())
+    return [{"name": t.name, "description": t.description, "arguments": t.input_schema} for t in tools]
+
+
 def _bounded(value: int, low: int, high: int) -> int:
     return max(low, min(int(value), high))

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from openvocab_occ.cli import main
 from openvocab_occ.errors import ConfigError
 from openvocab_occ.export.mcp_server import MOST_HITS, MapTools, server
 
@@ -85,6 +86,13 @@ def test_what_is_returned_is_bounded(tools, tmp_path):
     assert all("/" not in name and ".." not in name for name in names)
     with pytest.raises(ConfigError, match="no map to serve"):
         MapTools({})
+
+
+def test_the_command_describes_its_tools(saved, capsys):
+    assert main(["mcp", str(saved), "--json"]) == 0
+    tools = {tool["name"]: tool for tool in json.loads(capsys.readouterr().out)["tools"]}
+    assert set(tools) == {"brief", "diff", "ground", "object", "render"}
+    assert tools["ground"]["arguments"]["required"] == ["text"]
 
 
 def test_it_serves_on_standard_input_and_output(saved, tmp_path):

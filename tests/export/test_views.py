@@ -433,10 +433,31 @@ def test_labels_of_any_script_and_with_marks_of_markdown(street, tmp_path):
     assert all(row.count("|") == 12 for row in rows if row.startswith("|"))
 
 
+def test_a_camera_inside_a_voxel_sees_that_voxel(street, tmp_path):
+    wall = next(item for item in street.objects if item.label == "building")
+    place = wall.points[len(wall.points) // 2].astype(float)
+    inside = pinhole(64, 48, 1.0, look_at(place, place + np.array([1, 0.2, 0])))
+    bundle = export_views(street, tmp_path / "wall", viewpoints=inside)
+    jsonschema.Draft202012Validator(schema()).validate(json.loads(bundle.paths["view.json"].read_text()))
+    assert bundle.view["coverage"] == 1.0
+    assert len(bundle.view["objects"]) == 1
+    assert (read_depth(bundle.paths["depth.png"]) == 1).all()  # 0 would say that nothing is there
+
+
+def test_a_map_without_objects(street, tmp_path):
+    tree = ObjectTree([dataclasses.replace(street.objects.root, children=())])
+    bundle = export_views(dataclasses.replace(street, objects=tree), tmp_path / "bare")
+    jsonschema.Draft202012Validator(schema()).validate(json.loads(bundle.paths["view.json"].read_text()))
+    assert bundle.view["objects"] == []
+    assert bundle.view["pictures"] == {"view_marked.png": [], "bev_marked.png": []}
+    assert "nothing in view is large enough" in (bundle.folder / "prompt.md").read_text()
+    assert read_depth(bundle.paths["instance.png"]).max() == 0
+
+
 def test_five_thousand_objects(tmp_path):
     scene = many_things(5000)
     camera = pinhole(1024, 576, 1.0, look_at((-5, -5, 25), (60, 60, 0)))
-    bundle = export_views(scene, tmp_path / "many", viewpoints=camera)
+    bundle = export_views(scene, tmp_path / "many", viewpoints=camera, options=ViewOptions(least_pixels=400))
     view = bundle.view
     assert len(view["objects"]) > 1000
     assert sum(item["mark"] is not None for item in view["objects"]) == 20
