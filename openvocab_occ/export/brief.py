@@ -19,6 +19,7 @@ Side = Literal["left", "right", "ahead"]
 _LANE = 1.5  # metres to each side of the way that the ego takes up, with some room
 _BESIDE = 15.0  # metres from the way within which what can move is told
 _NEAR = 12.0  # metres within which other things are told
+_A_LANE = 3.5  # metres; a narrower road is one of which only a part was seen
 _AT_LEAST = 0.4  # metres of a thing on the road that narrow it
 _STEP = 1.0  # metres between places whose ground is looked up
 _UNSEEN = 3.0  # metres of unknown way that are worth telling
@@ -45,7 +46,7 @@ class RouteObject:
     on_road: bool
     narrows: tuple[float, float] | None = None
     """Width of the road there and the widest gap it leaves, metres; None where it leaves the road free, where it may
-    drive on, and where a rim of the road was not seen."""
+    drive on, and where not all of the road was seen."""
     last_seen: float = 0.0
 
     def text(self) -> str:
@@ -195,7 +196,7 @@ def _listed(
     on_road = left - right > 0 and min(high, left) - max(low, right) > _AT_LEAST
     narrows = None
     rims_seen = coverage_of(scene).seen(np.stack([_beside(way, middle, right - 0.6), _beside(way, middle, left + 0.6)]))
-    if on_road and rims_seen.all() and item.state not in ("moving", "stopped"):
+    if on_road and rims_seen.all() and left - right >= _A_LANE and item.state not in ("moving", "stopped"):
         narrows = (round(left - right, 2), round(max(left - high, low - right, 0.0), 2))
     length, width, height = (round(float(s), 2) for s in item.box.size)
     return RouteObject(
