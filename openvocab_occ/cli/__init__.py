@@ -48,6 +48,7 @@ COMMANDS = {
     "memory rebuild": Command("memory:rebuild", "make a map anew, without an agent or by another policy"),
     "memory export": Command("memory:export", "draw a map, or write its voxels to a file"),
     "crowdsource": Command("crowdsource:crowdsource", "let agents drive concurrently into one map"),
+    "eval memory": Command("eval_memory:memory", "show what the global map is good for, on synthetic streets"),
     "bench memory": Command("bench_memory:memory", "measure the global map"),
     "eval keyframe": Command("evaluate:keyframe", "judge depth and answers by the LiDAR of a real keyframe"),
     "bench depth": Command("bench:depth", "time depth images beside other ways to them"),

@@ -24,6 +24,8 @@ class Sighting(NamedTuple):
     """Name of the view."""
     box: tuple[int, int, int, int]
     """Left, top, right, bottom pixel, all inclusive."""
+    score: float = 0.0
+    """How good a picture of it this is, to compare sightings of one object by; 0 where that was not recorded."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,6 +47,7 @@ def test_a_map_comes_back_as_it_was(scene, saved):
             b.id, b.label, b.score, b.state, b.level, b.parent, b.children,
         )  # fmt: skip
         assert a.box.yaw == b.box.yaw
+        assert a.views == b.views
         for name in ("voxels", "points", "embedding", "center"):
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
     for a, b in zip(back.frames, scene.frames, strict=True):
