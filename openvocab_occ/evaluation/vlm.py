@@ -12,7 +12,7 @@ from openvocab_occ.export.views import ViewBundle
 from openvocab_occ.export.views.prompt import ANSWER_FORM, SYSTEM, messages, picture_names, prompt_text
 from openvocab_occ.query.llm import LanguageModel, unfenced
 
-KINDS = ("count", "exists", "side", "nearest", "state", "ahead")
+KINDS = ("count", "exists", "side", "nearest", "state", "ahead", "on_road")
 """Kinds of questions, in the order of reports."""
 Answer = int | str
 

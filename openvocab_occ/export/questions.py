@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from openvocab_occ.export.brief import RouteBrief
 from openvocab_occ.objects.kinds import Kind, kind_of
 
 _SIDE, _MARGIN = 5.0, 1.5  # degrees off ahead, and metres between ranges, from which an answer is beyond doubt
@@ -14,18 +15,31 @@ _SETTLED = ("parked", "moving", "stopped")
 Question = dict[str, Any]
 
 
-def questions_about(view: dict[str, Any]) -> list[Question]:
+def questions_about(view: dict[str, Any], brief: RouteBrief | None = None) -> list[Question]:
     """Return questions about the content of a view.json, each with its answer; the same view gives the same ones.
 
     Only what is beyond doubt is asked: observed states, sides and distances that clearly differ. `answer` is a whole
-    number, `yes` or `no`, a mark, or one of `choices`; `kind` is count, exists, side, nearest, state or ahead.
+    number, `yes` or `no`, a mark, or one of `choices`; `kind` is count, exists, side, nearest, state or ahead;
+    with a brief of the way also on_road, which the pictures tell and the words do not.
     """
     marked = sorted((o for o in view["objects"] if o["mark"]), key=lambda o: o["mark"])
     makers: tuple[Callable[[list[dict[str, Any]]], Iterator[Question]], ...] = (
         _counts, _exists, _sides, _nearest, _states, _ahead,
     )  # fmt: skip
     found = [question for make in makers for question in _some(list(make(marked)))]
+    if brief is not None:
+        found += _some(list(_on_road(marked, brief)))
     return [{"id": number, **question} for number, question in enumerate(found, start=1)]
+
+
+def _on_road(marked: list[dict[str, Any]], brief: RouteBrief) -> Iterator[Question]:
+    where = {one.id: one for one in brief.objects}
+    for item in marked:
+        one = where.get(item["id"])
+        if one is not None and one.state != "moving":
+            yield {"kind": "on_road", "question": f"Does mark {item['mark']} stand on the road?",
+                   "answer": "yes" if one.on_road else "no", "choices": ["yes", "no"],
+                   "marks": [item["mark"]]}  # fmt: skip
 
 
 def _some(questions: list[Question]) -> list[Question]:

@@ -116,6 +116,17 @@ def test_views_along_a_route(watched, tmp_path):
     assert [b.view["viewpoint"]["method"] for b in bundles] == ["ahead", "ahead"]
     for bundle, station in zip(bundles, (0.0, 20.0), strict=True):
         np.testing.assert_allclose(np.array(bundle.view["ego"]["T_world_ego"])[:2, 3], [-28 + station, -2], atol=1e-6)
+    told = json.loads((tmp_path / "route" / "brief.json").read_text())
+    assert told == json.loads(json.dumps(brief_route(watched, route).to_dict()))
+    road = {one["id"]: one["on_road"] for one in told["objects"]}
+    asked = 0
+    for bundle in bundles:
+        marks = {item["mark"]: item["id"] for item in bundle.view["objects"] if item["mark"]}
+        for one in json.loads((bundle.folder / "questions.json").read_text())["questions"]:
+            if one["kind"] == "on_road":
+                assert one["answer"] == ("yes" if road[marks[one["marks"][0]]] else "no")
+                asked += 1
+    assert asked
     with pytest.raises(ConfigError, match="viewpoints or a route, got both"):
         export_views(watched, tmp_path / "both", route=route, viewpoints=[])
 

@@ -10,6 +10,7 @@ from typing import Any, Literal, get_args, overload
 import numpy as np
 
 from openvocab_occ.errors import ConfigError, MapError
+from openvocab_occ.export.brief import RouteBrief, brief_route
 from openvocab_occ.export.draw import SKY, paint, relevance_colors
 from openvocab_occ.export.overhead import Extent, level, render_overhead
 from openvocab_occ.export.questions import questions_about
@@ -167,7 +168,8 @@ def export_views(
         out: The folder.
         viewpoints: Cameras, used as they are, or lookouts. Without one, CAM_FRONT (else the first camera) of the middle
             frame, scaled to fit into width x height; of a map without cameras, an overview of that size.
-        route: Look ahead from along it, every 20 m; it is drawn in the pictures from above.
+        route: Look ahead from along it, every 20 m; it is drawn in the pictures from above, and `brief.json` beside the
+            bundles tells what comes along it.
         query: An answer, or words for `find` (of a `dense` map pass an answer). Its hits are numbered first and drawn
             in gold.
         width: Pixels of cameras that are chosen here.
@@ -208,13 +210,16 @@ def export_views(
         return ViewBundle(target, drawn.view)
     names = [f"{number:02d}_{_slug(stand.name)}" for number, stand in enumerate(stands)]
     views = []
+    brief = None if route is None else brief_route(scene, route)
     with written_folder(target, marker=INDEX) as folder:
         for name, stand in zip(names, stands, strict=True):
             (folder / name).mkdir()
             drawn = _draw(scene, stand, answer, options, path)
-            _write(drawn, folder / name, options)
+            _write(drawn, folder / name, options, brief)
             views.append(drawn.view)
         index = [{"folder": name, **view["viewpoint"]} for name, view in zip(names, views, strict=True)]
+        if brief is not None:
+            (folder / "brief.json").write_text(as_json(brief.to_dict()), encoding="utf-8")
         (folder / INDEX).write_text(as_json({"schema": "openvocab_occ.views", "views": index}), encoding="utf-8")
     return [ViewBundle(target / name, view) for name, view in zip(names, views, strict=True)]
 
@@ -315,7 +320,7 @@ def _tags(tags: Sequence[Tag]) -> list[dict[str, Any]]:
     ]
 
 
-def _write(drawn: _Drawn, folder: Path, options: ViewOptions) -> None:
+def _write(drawn: _Drawn, folder: Path, options: ViewOptions, brief: RouteBrief | None = None) -> None:
     for name, image in drawn.images.items():
         (folder / name).parent.mkdir(exist_ok=True)
         write_image(folder / name, image)
@@ -324,7 +329,7 @@ def _write(drawn: _Drawn, folder: Path, options: ViewOptions) -> None:
     (folder / "prompt.md").write_text(text, encoding="utf-8")
     shown = [folder / name for name in picture_names(marks=options.marks, bev=options.bev)]
     (folder / "messages.json").write_text(json.dumps(messages(text, shown), ensure_ascii=False), encoding="utf-8")
-    questions = {"schema": "openvocab_occ.questions", "questions": questions_about(drawn.view)}
+    questions = {"schema": "openvocab_occ.questions", "questions": questions_about(drawn.view, brief)}
     (folder / "questions.json").write_text(as_json(questions), encoding="utf-8")
 
 
