@@ -147,3 +147,35 @@ def _short(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     return ", ".join(f"{k} {_short(v)}" for k, v in value.items()) if isinstance(value, dict) else str(value)
+
+
+def views(
+    *, voxels: int = 1_000_000, width: int = 1024, height: int = 576, rounds: int = 9, threads: int = 2,
+    json: bool = False,
+) -> None:  # fmt: skip
+    """Time pictures of a made-up map of a million voxels, from different places of its streets.
+
+    Args:
+        voxels: Of the map.
+        width: Pixels.
+        height: Pixels.
+        rounds: Views.
+        threads: Cores to use.
+        json: Print one JSON object.
+    """
+    from openvocab_occ.evaluation.bench_views import time_views
+
+    times = time_views(voxels=voxels, width=width, height=height, rounds=rounds, threads=threads)
+    if json:
+        print_json(asdict(times) | {"synthetic": True})
+        return
+    out = console()
+    machine = f"{platform.machine()}, {platform.system()}, {datetime.datetime.now(datetime.UTC).date()}"
+    out.print(
+        f"{times.voxels:,} synthetic voxels, {times.faces:,} faces, {width} x {height}, median of {rounds}, "
+        f"{times.threads} threads, {machine}\n"
+    )
+    table = Table("picture", "seconds", box=None, pad_edge=False)
+    for name in ("first", "ids", "cpu_ids", "cpu_shaded", "palette", "shaded", "panorama", "overhead"):
+        table.add_row(name, f"{getattr(times, name):.3f}")
+    out.print(table)

@@ -1,21 +1,21 @@
-"""A rendered view as pictures that a person reads."""
+"""A rendered view as pictures: exact for programs, shaded and outlined for eyes."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int32, UInt8
 
-from openvocab_occ.export.palette import NOTHING, grey
+from openvocab_occ._jit import in_slices
+from openvocab_occ.export._shade_kernels import shade
+from openvocab_occ.export.palette import NOTHING, grey, paint_numbers
 from openvocab_occ.export.render import MapView
-from openvocab_occ.geometry import transform
-from openvocab_occ.mapping.voxel_map import VoxelMap
+from openvocab_occ.export.surface import Surface
+from openvocab_occ.geometry import Camera
 
 SKY = (226, 234, 242)
 """Where pictures for people show nothing."""
-_SHADE = (0.80, 0.90, 1.0)  # of faces across x, y and z: the ground is lightest
-_LEAST_PIXELS = 150  # a smaller object has no room for its name
-_MOST_NAMES = 20
-_ROOMY = 10  # names on an object cover at most a tenth of it
+_SHADES = np.array([0.72, 0.86, 1.0])  # of faces across x, y and z: the ground is lightest
+_HAZE = np.array([0.004, 0.35])  # of the sky's colour for each metre, and at most
 
 
 def paint(
@@ -26,76 +26,71 @@ def paint(
     return table[view.voxel]
 
 
-def draw_view(
-    view: MapView,
-    voxels: VoxelMap,
-    colors: UInt8[np.ndarray, "n 3"],
-    names: dict[int, str],
-    hits: Sequence[int] | None = None,
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Draw voxels with shaded faces, outlines around objects and names on them.
+def shaded(view: MapView, colors: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Draw voxels with shaded faces, paler in the distance."""
+    camera, surface = view.camera, view.surface
+    out = np.empty((*view.voxel.shape, 3), np.uint8)
+    rays = _world_rays(camera)
+    centers, sky = surface.centers32, np.array(SKY, np.float64)
 
-    Args:
-        view: What each pixel shows.
-        voxels: The map.
-        colors: Colour of each voxel.
-        names: Text for each object, by id; only these are named, larger ones first.
-        hits: Ids of the objects that answer a query; all else is greyed. None where there was no query.
-    """
-    image = paint(view, colors, SKY)
-    met = view.voxel >= 0
-    if hits is not None:
-        faded = met & ~np.isin(view.item, np.asarray(hits, np.int32))
-        image[faded] = grey(image[faded])
-    shade = np.ones(view.voxel.shape, np.float32)
-    shade[met] = np.asarray(_SHADE, np.float32)[_face_axis(view, voxels)[met]]
-    image = (image * shade[..., None]).astype(np.uint8)
-    image[_edges(view.item, hits)] = 255
-    return _with_names(image, view.item, names)
+    def rows(start: int, stop: int) -> None:
+        shade(
+            rays, camera.position, view.depth, view.voxel, centers, colors, sky, _SHADES, _HAZE, start, stop, out
+        )  # fmt: skip
+
+    in_slices(rows, len(out), grain=16)
+    return out
 
 
-def _face_axis(view: MapView, voxels: VoxelMap) -> Int32[np.ndarray, "h w"]:
-    """Return the axis that each pixel's face is across: that in which the point met lies farthest from the centre."""
-    points = transform(view.camera.T_world_cam, view.camera.rays() * view.depth[..., None])
-    offset = np.abs(points - voxels.centers[view.voxel])
-    return np.nan_to_num(offset).argmax(axis=-1).astype(np.int32)
+def _world_rays(camera: Camera) -> Float[np.ndarray, "h w 3"]:
+    """Return the rays of `camera.rays()` along world axes; those of a pinhole are affine in the pixel."""
+    R = camera.T_world_cam[:3, :3]
+    if camera.lens != "pinhole":
+        return camera.rays() @ R.T
+    M = R @ np.linalg.inv(camera.K)
+    rays = np.empty((camera.height, camera.width, 3))
+    v, u = np.arange(camera.height)[:, None], np.arange(camera.width)
+    for axis in range(3):
+        rays[..., axis] = M[axis, 0] * u + (M[axis, 1] * v + M[axis, 2])
+    return rays
 
 
-def _edges(item: Int32[np.ndarray, "h w"], hits: Sequence[int] | None) -> Bool[np.ndarray, "h w"]:
-    """Tell which pixels are the rim of an object, of hits only where there are some."""
-    kept = item if hits is None else np.where(np.isin(item, np.asarray(hits, np.int32)), item, 0)
+def relevance_colors(surface: Surface, scores: Mapping[int, float]) -> UInt8[np.ndarray, "n 3"]:
+    """Return colours of voxels: objects with a score from dark (0) to bright (1), all else grey."""
+    colors = grey(surface.palette)
+    ids = np.array(sorted(scores), np.int64)
+    painted = paint_numbers(np.array([scores[int(id)] for id in ids], np.float64), 0.0, 1.0, "plasma")
+    for id, color in zip(ids, painted, strict=True):
+        rows = surface.rows_by_item.get(int(id))
+        if rows is not None:
+            colors[rows] = color
+    return colors
+
+
+def outlines(item: Int32[np.ndarray, "h w"], ids: Collection[int], width: int = 1) -> Bool[np.ndarray, "h w"]:
+    """Tell which pixels lie on the inner rim of some objects, `width` pixels wide."""
+    kept = np.where(np.isin(item, np.array(sorted(ids), np.int64)), item, 0)
     edge = np.zeros(kept.shape, dtype=bool)
-    edge[:, 1:] |= kept[:, 1:] != kept[:, :-1]
-    edge[1:] |= kept[1:] != kept[:-1]
-    return edge
+    for axis in (0, 1):
+        for step in (*range(-width, 0), *range(1, width + 1)):
+            edge |= kept != _shifted(kept, step, axis)
+    return edge & (kept > 0)
 
 
-def _with_names(
-    image: UInt8[np.ndarray, "h w 3"], item: Int32[np.ndarray, "h w"], names: dict[int, str]
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Write names at the innermost pixel of their objects, where they cover no other name."""
-    import cv2
+def _shifted(image: np.ndarray, step: int, axis: int) -> np.ndarray:
+    """Return the image moved by some pixels, its border repeated."""
+    at = np.clip(np.arange(image.shape[axis]) + step, 0, image.shape[axis] - 1)
+    return np.take(image, at, axis=axis)
 
-    drawn = image.copy()
-    counts = np.bincount(item.reshape(-1))
-    ids = [id_ for id_ in names if 0 < id_ < len(counts) and counts[id_] >= _LEAST_PIXELS]
-    taken: list[Float[np.ndarray, " 4"]] = []
-    for id_ in sorted(ids, key=lambda id_: -counts[id_])[:_MOST_NAMES]:
-        text = names[id_].encode("ascii", "replace").decode()  # OpenCV's font knows no other letters
-        (width, height), base = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
-        mask = item == id_
-        inner = cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
-        v, u = (int(i) for i in np.unravel_index(int(np.argmax(inner)), inner.shape))
-        if inner.max() < width / 2 and np.count_nonzero(mask) < _ROOMY * width * height:
-            v = int(np.flatnonzero(mask.any(axis=1))[0]) - height  # above an object that its name would hide
-        left = float(np.clip(u - width / 2, 4, max(image.shape[1] - width - 4, 4)))
-        bottom = float(np.clip(v + height / 2, height + 4, max(image.shape[0] - base - 4, height + 4)))
-        box = np.array([left - 4, bottom - height - 4, left + width + 4, bottom + base + 2])
-        if any((box[:2] < other[2:]).all() and (other[:2] < box[2:]).all() for other in taken):
-            continue
-        taken.append(box)
-        x0, y0, x1, y1 = box.astype(int).tolist()
-        cv2.rectangle(drawn, (x0, y0), (x1, y1), (0, 0, 0), -1)
-        at = (int(left), int(bottom))
-        cv2.putText(drawn, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
-    return drawn
+
+def blend(
+    image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], color: Sequence[int], share: float = 1.0
+) -> None:
+    """Mix a colour into some pixels, in place."""
+    mixed = image[mask] * (1 - share) + np.array(color, np.float64) * share
+    image[mask] = mixed.astype(np.uint8)
+
+
+def to_pixels(values: Float[np.ndarray, "n 2"]) -> list[tuple[int, int]]:
+    """Return points as OpenCV takes them."""
+    return [(round(float(u)), round(float(v))) for u, v in values]

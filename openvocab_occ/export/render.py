@@ -1,6 +1,7 @@
 """The map as a camera sees it: for each pixel the voxel met, its depth and its object."""
 
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, Int64
@@ -8,13 +9,17 @@ from jaxtyping import Bool, Float, Float32, Int32, Int64
 from openvocab_occ.arrays import ArrayLike
 from openvocab_occ.depth.render import render_depth
 from openvocab_occ.errors import MapError
+from openvocab_occ.export.surface import Surface, surface_of
+from openvocab_occ.export.surface import owners as owners
 from openvocab_occ.geometry import Camera, GridSpec, invert, look_at, transform
-from openvocab_occ.mapping.voxel_map import VoxelMap
 from openvocab_occ.objects.scene_map import SceneMap
 from openvocab_occ.occupancy.grid import GEOMETRY_CLASSES, OccupancyGrid
+from openvocab_occ.occupancy.rays import trace
 
 _OCCUPIED, _FREE = 0, 1  # of GEOMETRY_CLASSES
 _RISE = 0.7  # metres up for each metre back, of an overview
+_WHOLE = 1 << 25  # voxels of a dense grid that is kept; more are cut down to what a camera can see
+_MARGIN = 32  # voxels by which a kept grid reaches farther than asked, so that the next view needs no other
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,34 +30,146 @@ class MapView:
     depth: Float32[np.ndarray, "h w"]
     """z-depth to the entry into the voxel, metres; `max_depth` where nothing is met."""
     voxel: Int32[np.ndarray, "h w"]
-    """Position in the map of the voxel met, -1 where none."""
+    """Row of the voxel met in `surface`, which is its position in the map where it is one of the map's; -1: none."""
     item: Int32[np.ndarray, "h w"]
     """Id of its object, 0 where none."""
+    surface: Surface
+
+
+@dataclass(frozen=True, eq=False)
+class Panorama:
+    """All around a place, level: a column is a direction, the left end and the right end are behind."""
+
+    position: Float[np.ndarray, " 3"]
+    heading: float
+    """Radians from the world's x axis, of the middle column."""
+    elevation: tuple[float, float]
+    """Radians of the lowest and the highest row against the level."""
+    distance: Float32[np.ndarray, "h w"]
+    """Metres along the ray; `max_range` where nothing is met."""
+    voxel: Int32[np.ndarray, "h w"]
+    """As in MapView."""
+    item: Int32[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Window:
+    """A part of the map as a dense grid."""
+
+    low: Int64[np.ndarray, " 3"]
+    grid: OccupancyGrid
+    row: Int32[np.ndarray, " n"]
+    """Row of the surface for each voxel of the grid; -1 where it is free, and once more at the end."""
+
+
+class Renderer:
+    """Draws one map from many places; keeps the part of it around the last place as a dense grid with its faces."""
+
+    def __init__(self, scene: SceneMap, *, filled: bool = False) -> None:
+        """Take a map; `filled` closes holes of one voxel in surfaces, for pictures that people look at."""
+        self.surface = surface_of(scene)
+        self.filled = filled
+        self._window: _Window | None = None
+        keys = self.surface.keys
+        self._bounds = (keys.min(axis=0).astype(np.int64), keys.max(axis=0).astype(np.int64) + 1) if len(keys) else None
+
+    def view(self, camera: Camera, max_depth: float = 100.0) -> MapView:
+        """Cast a ray through each pixel and find the first voxel within `max_depth`."""
+        size = (camera.height, camera.width)
+        window = self._around(*_reach(camera, max_depth))
+        if window is None:
+            depth = np.full(size, max_depth, np.float32)
+            return MapView(camera, depth, np.full(size, -1, np.int32), np.zeros(size, np.int32), self.surface)
+        image = render_depth(window.grid, camera, max_depth=max_depth)
+        voxel = window.row[image.voxel]  # -1 reads the last entry
+        return MapView(camera, image.depth, voxel, self._items(voxel), self.surface)
+
+    def panorama(
+        self,
+        position: ArrayLike,
+        heading: float = 0.0,
+        *,
+        width: int = 2048,
+        elevation: tuple[float, float] = (-0.6, 0.4),
+        max_range: float = 100.0,
+    ) -> Panorama:
+        """Look all around; pixels are square in angle, which gives the height."""
+        place = np.asarray(position, dtype=np.float64)
+        step = 2 * np.pi / width
+        height = max(round((elevation[1] - elevation[0]) / step), 1)
+        azimuth = heading + np.pi - (np.arange(width) + 0.5) * step  # from behind over left, ahead and right
+        rise = elevation[1] - (np.arange(height) + 0.5) * (elevation[1] - elevation[0]) / height
+        level = np.cos(rise)[:, None]
+        rays = np.stack(
+            [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(rise)[:, None] + 0 * azimuth], axis=-1
+        ).reshape(-1, 3)
+        window = self._around(place - max_range, place + max_range)
+        if window is None:
+            t, voxel = np.full(len(rays), max_range, np.float32), np.full(len(rays), -1, np.int32)
+        else:
+            t, voxel = trace(window.grid, place[None], rays, max_range)
+            voxel = window.row[voxel]
+        voxel = voxel.reshape(height, width)
+        low_high = (float(elevation[0]), float(elevation[1]))
+        return Panorama(place, heading, low_high, t.reshape(height, width), voxel, self._items(voxel))
+
+    def _items(self, voxel: Int32[np.ndarray, "h w"]) -> Int32[np.ndarray, "h w"]:
+        return np.append(self.surface.item, np.int32(0))[voxel]  # -1 reads the appended 0
+
+    def _around(self, low: Float[np.ndarray, " 3"], high: Float[np.ndarray, " 3"]) -> _Window | None:
+        """Return a dense grid that holds all voxels of a box in the world; None where there are none."""
+        if self._bounds is None:
+            return None
+        first, last = self._bounds
+        if np.prod((last - first).astype(np.float64)) > _WHOLE:
+            size = self.surface.voxel_size
+            a = np.maximum(np.floor(np.clip(low / size, -1e8, 1e8)).astype(np.int64) - 1, first)
+            b = np.minimum(np.ceil(np.clip(high / size, -1e8, 1e8)).astype(np.int64) + 1, last)
+            if (a >= b).any():
+                return None
+            kept = self._window
+            if kept is not None and (kept.low <= a).all() and (b <= kept.low + kept.grid.spec.shape).all():
+                return kept
+            wide = np.maximum(a - _MARGIN, first), np.minimum(b + _MARGIN, last)
+            first, last = wide if np.prod((wide[1] - wide[0]).astype(np.float64)) <= _WHOLE else (a, b)
+            self._window = None
+        if self._window is None:
+            self._window = self._built(first, last)
+        return self._window
+
+    def _built(self, low: Int64[np.ndarray, " 3"], high: Int64[np.ndarray, " 3"]) -> _Window | None:
+        keys = self.surface.keys
+        rows = np.flatnonzero(((keys >= low) & (keys < high)).all(axis=1)).astype(np.int32)
+        if not len(rows):
+            return None
+        shape = high - low
+        size = self.surface.voxel_size
+        spec = GridSpec(tuple((low * size).tolist()), size, tuple(shape.tolist()))
+        flat = spec.flat(keys[rows].astype(np.int64) - low)
+        row = np.full(spec.num_voxels + 1, -1, np.int32)
+        row[flat] = rows
+        if self.filled:
+            holes, beside = _holes((row[:-1] >= 0).reshape(spec.shape))
+            row[holes] = row[beside]
+        labels = np.where(row[:-1] >= 0, np.uint8(_OCCUPIED), np.uint8(_FREE)).reshape(spec.shape)
+        grid = OccupancyGrid(labels, spec, free_label=_FREE, class_names=GEOMETRY_CLASSES)
+        return _Window(low, grid, row)
 
 
 def render_map(scene: SceneMap, camera: Camera, max_depth: float = 100.0) -> MapView:
     """Cast a ray through each pixel and find the first voxel of the map within `max_depth`."""
-    voxels = scene.voxels
-    window = _window(voxels, np.flatnonzero(_in_view(voxels, camera, max_depth)))
-    if window is None:
-        size = (camera.height, camera.width)
-        depth = np.full(size, max_depth, np.float32)
-        return MapView(camera, depth, np.full(size, -1, np.int32), np.zeros(size, np.int32))
-    grid, flat, voxel_at = window
-    image = render_depth(grid, camera, max_depth=max_depth)
-    hit = image.voxel >= 0
-    voxel = np.full(image.voxel.shape, -1, np.int32)
-    voxel[hit] = voxel_at[np.searchsorted(flat, image.voxel[hit])]
-    owner = np.append(owners(scene), np.int32(0))  # position -1 reads the appended 0
-    return MapView(camera, image.depth, voxel, owner[voxel])
+    return renderer_of(scene).view(camera, max_depth)
 
 
-def owners(scene: SceneMap) -> Int32[np.ndarray, " n"]:
-    """Return for each voxel the id of its object, 0 where none; of several the one with the fewest voxels."""
-    owner = np.zeros(len(scene.voxels), np.int32)
-    for item in sorted(scene.objects, key=lambda item: -len(item.voxels)):
-        owner[item.voxels] = item.id
-    return owner
+def renderer_of(scene: SceneMap, *, filled: bool = False) -> Renderer:
+    """Return a map's renderer, made at the first call."""
+    kept = _KEPT[filled]
+    if scene not in kept:
+        kept[scene] = Renderer(scene, filled=filled)
+    return kept[scene]
+
+
+_KEPT: "dict[bool, WeakKeyDictionary[SceneMap, Renderer]]" = {False: WeakKeyDictionary(), True: WeakKeyDictionary()}
 
 
 def overview(scene: SceneMap, aspect: float = 16 / 9, fov: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -95,40 +212,34 @@ def heading(scene: SceneMap) -> Float[np.ndarray, " 3"]:
     return total / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])
 
 
-def _in_view(voxels: VoxelMap, camera: Camera, max_depth: float) -> Bool[np.ndarray, " n"]:
-    """Tell which voxels may be met by a ray: those whose bounding sphere touches the pyramid around all rays."""
-    local = transform(invert(camera.T_world_cam), voxels.centers)
-    radius = voxels.voxel_size * np.sqrt(3) / 2
-    rays = camera.rays().reshape(-1, 3)
-    rays = rays[np.isfinite(rays[:, 0])]
-    if not len(rays):
-        return np.zeros(len(local), dtype=bool)
-    low, high = rays.min(axis=0), rays.max(axis=0)
-    inside = (local[:, 2] > -radius) & (local[:, 2] < max_depth + radius)
-    for axis in (0, 1):
-        inside &= local[:, axis] - high[axis] * local[:, 2] < radius * np.hypot(1.0, high[axis])
-        inside &= low[axis] * local[:, 2] - local[:, axis] < radius * np.hypot(1.0, low[axis])
-    return inside
+def _holes(occupied: Bool[np.ndarray, "x y z"]) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]]:
+    """Return the holes of one voxel in surfaces, and for each an occupied voxel beside it, as flat indices.
 
-
-def _window(
-    voxels: VoxelMap, chosen: Int64[np.ndarray, " k"]
-) -> tuple[OccupancyGrid, Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]] | None:
-    """Return a dense grid around voxels of the map, their flat indices in it, ascending, and the voxels in that order.
-
-    None where there are no voxels.
+    A hole is free and has its four neighbours in one of the lattice's planes occupied.
     """
-    if not len(chosen):
-        return None
-    keys = voxels.keys[chosen].astype(np.int64)
-    lowest = keys.min(axis=0)
-    shape = keys.max(axis=0) - lowest + 1
-    # the lattice of the map is where its voxels say it is
-    origin = voxels.centers[chosen[0]] + (lowest - keys[0] - 0.5) * voxels.voxel_size
-    spec = GridSpec(tuple(origin.tolist()), voxels.voxel_size, tuple(shape.tolist()))
-    flat = spec.flat(keys - lowest)
-    order = np.argsort(flat)
-    labels = np.full(spec.num_voxels, _FREE, np.uint8)
-    labels[flat] = _OCCUPIED
-    grid = OccupancyGrid(labels.reshape(spec.shape), spec, free_label=_FREE, class_names=GEOMETRY_CLASSES)
-    return grid, flat[order], chosen[order]
+    wide = np.pad(occupied, 1)
+    beside = [
+        wide[1 + x : wide.shape[0] - 1 + x, 1 + y : wide.shape[1] - 1 + y, 1 + z : wide.shape[2] - 1 + z]
+        for axis in np.eye(3, dtype=int)
+        for x, y, z in (axis, -axis)
+    ]
+    pairs = [beside[0] & beside[1], beside[2] & beside[3], beside[4] & beside[5]]
+    holes = ((pairs[0] & pairs[1]) | (pairs[0] & pairs[2]) | (pairs[1] & pairs[2])) & ~occupied
+    index = np.argwhere(holes)
+    strides = np.array([occupied.shape[1] * occupied.shape[2], occupied.shape[2], 1])
+    flat = index @ strides
+    along_x = pairs[0][holes]
+    return flat, flat + np.where(along_x, strides[0], strides[1])
+
+
+def _reach(camera: Camera, max_depth: float) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+    """Return the corners of a box around all that the rays of a camera can meet."""
+    u = np.linspace(0, camera.width - 1, 9)
+    v = np.linspace(0, camera.height - 1, 9)
+    rays = camera.unproject(np.stack(np.meshgrid(u, v), axis=-1)).reshape(-1, 3)
+    if camera.lens != "pinhole":
+        rays = camera.rays().reshape(-1, 3)
+    rays = rays[np.isfinite(rays[:, 0])]
+    ends = np.concatenate([rays * max_depth, np.zeros((1, 3))])
+    points = transform(camera.T_world_cam, ends)
+    return points.min(axis=0), points.max(axis=0)

@@ -8,8 +8,9 @@ goes wrong, the grammar's own reading is the answer, with a note that says why.
 import json
 import urllib.error
 import urllib.request
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from openvocab_occ.errors import ConfigError, QueryError
 from openvocab_occ.query import algebra as q
@@ -59,14 +60,25 @@ class LanguageModel:
 
     def _ask(self, text: str, labels: Sequence[str]) -> q.Node:
         known = f"\nThe map's labels: {', '.join(labels)}" if labels else ""
+        messages = [
+            {"role": "system", "content": _TASK + json.dumps(q.json_schema()) + known},
+            {"role": "user", "content": text},
+        ]
+        query = q.from_json(unfenced(self.chat(messages)))
+        if any(isinstance(node, q.Vector | q.Crop | q.Click) for node in q.walk(query)):
+            raise QueryError("a language model cannot know vectors, pictures or rays", got=type(query).__name__)
+        return query
+
+    def chat(self, messages: Sequence[Mapping[str, Any]]) -> str:
+        """Return what the service replies to chat messages, asked for JSON at temperature 0.
+
+        Raises OSError where it cannot be reached, QueryError where its reply is too large or has another form.
+        """
         body = {
             "model": self.model,
             "temperature": 0,
             "response_format": {"type": "json_object"},
-            "messages": [
-                {"role": "system", "content": _TASK + json.dumps(q.json_schema()) + known},
-                {"role": "user", "content": text},
-            ],
+            "messages": list(messages),
         }
         headers = {"Content-Type": "application/json"} | ({"Authorization": f"Bearer {self.key}"} if self.key else {})
         address = self.url.rstrip("/") + "/chat/completions"
@@ -82,10 +94,7 @@ class LanguageModel:
             raise QueryError("reply of the language model has another form", got=type(error).__name__) from None
         if not isinstance(said, str):
             raise QueryError("reply of the language model holds no text", got=type(said).__name__)
-        query = q.from_json(_unfenced(said))
-        if any(isinstance(node, q.Vector | q.Crop | q.Click) for node in q.walk(query)):
-            raise QueryError("a language model cannot know vectors, pictures or rays", got=type(query).__name__)
-        return query
+        return said
 
 
 class _NoRedirect(urllib.request.HTTPRedirectHandler):
@@ -95,7 +104,7 @@ class _NoRedirect(urllib.request.HTTPRedirectHandler):
         return None
 
 
-def _unfenced(text: str) -> str:
+def unfenced(text: str) -> str:
     """Return what stands between the fences that models like to put around JSON."""
     text = text.strip()
     if text.startswith("```") and text.endswith("```"):
