@@ -16,7 +16,7 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
-    "demo": Command("demo:demo", "build, ask, export and show the map of a synthetic street"),
+    "demo": Command("demo:demo", "map a drive through the synthetic city, ask it, show it"),
     "city": Command("city:city", "write a made-up town, driven many times, as a nuScenes tree"),
     "doctor": Command("doctor:doctor", "look at a drive before it is mapped, and say what is wrong"),
     "map": Command("map:build", "turn a drive and an ONNX model into a map"),
