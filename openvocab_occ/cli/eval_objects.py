@@ -81,6 +81,7 @@ def _table(rows: list[dict[str, Any]]) -> Table:
         "center m": lambda r: f"{r['boxes']['center_m']:.2f}",
         "yaw deg": lambda r: f"{r['boxes']['yaw_deg']:.0f}",
         "s/frame": lambda r: f"{r['seconds_per_frame']:.2f}",
+        "CPU s/frame": lambda r: f"{r['cpu_seconds_per_frame']:.2f}",
         "purity": lambda r: f"{r['regions']['purity']:.2f}" if "regions" in r else "",
         "junctions": lambda r: f"{r['regions']['right']} of {r['regions']['junctions']}" if "regions" in r else "",
     }

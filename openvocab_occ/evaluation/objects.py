@@ -7,7 +7,7 @@ true state comes from the same rule as the predicted one, applied to exact posit
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -60,6 +60,8 @@ class ObjectReport:
     boxes: BoxErrors
     seconds_per_frame: float
     """Median time of a frame for segments and tracks."""
+    cpu_seconds_per_frame: float = 0.0
+    """The same in processor time, which other work on the machine does not change."""
     missed: tuple[str, ...] = field(repr=False)
     """Counted things without a prediction of IoU 0.5: class, voxels, IoU."""
 
@@ -80,18 +82,21 @@ def judge_objects(
     builder = MapBuilder(encoder, objects=config)
     record = Record()
     seconds: list[float] = []
+    cpu: list[float] = []
     for done, frame in enumerate(frames, start=1):
         if isinstance(encoder, TruthEncoder):
             encoder.prepare(frame, truth)
         builder.integrate(frame)
         assert builder.objects is not None, "there is a first frame"
         seconds.append(builder.objects.seconds)
+        cpu.append(builder.objects.cpu_seconds)
         record.add(frame, truth, builder)
         if progress is not None:
             progress(done, len(frames))
     scene = builder.snapshot()
     assert builder.objects is not None, "there is a first frame"
-    return record.report(scene, builder.objects.merged, seconds), scene
+    report = record.report(scene, builder.objects.merged, seconds)
+    return replace(report, cpu_seconds_per_frame=float(np.median(cpu)) if cpu else 0.0), scene
 
 
 class Record:

@@ -35,7 +35,7 @@ def cut_bridge(packed: Int64[np.ndarray, " n"], name: str, voxel_size: float) ->
     yaw = principal_yaw(xy)
     along = xy @ np.array([np.cos(yaw), np.sin(yaw)])
     along -= along.min()
-    slices = np.floor(along / voxel_size).astype(int)
+    slices = np.floor(along / voxel_size + 0.01).astype(int)  # rounding must not empty a slice
     filled = np.bincount(slices).astype(np.float64)
     edge = max(round((least - _SLACK) / voxel_size), 1)
     if len(filled) < 2 * edge + 1:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field
-from time import perf_counter
+from time import perf_counter, process_time
 
 import numpy as np
 from jaxtyping import Int64
@@ -65,6 +65,8 @@ class ObjectBuilder:
         """Tracks that the last batch refinement merged into others, and into which."""
         self.seconds = 0.0
         """What segments and tracks of the last frame took."""
+        self.cpu_seconds = 0.0
+        """The same in processor time, of all threads of the process."""
         self.latest: Observation | None = None
         """What the last frame gave."""
         self._tracker = Tracker(voxel_size, self.names, self.config.tracks)
@@ -76,10 +78,10 @@ class ObjectBuilder:
 
     def observe(self, frame: FrameVoxels) -> Observation:
         """Add a frame and return what was seen in it."""
-        start = perf_counter()
+        start, cpu = perf_counter(), process_time()
         segments = segment_frame(frame, self.names, self.config.segments)
         ids = self._tracker.observe(segments, frame=frame.index, time=frame.timestamp)
-        self.seconds = perf_counter() - start
+        self.seconds, self.cpu_seconds = perf_counter() - start, process_time() - cpu
         self.latest = Observation(
             frame=frame.index, seen=frame.packed[frame.seen], segments=tuple(segments), tracks=tuple(ids)
         )

@@ -167,8 +167,8 @@ def test_what_may_be_one_thing_is_cut_at_a_clear_gap_only():
     cab, box = block("truck", (0, 0, 0), (12, 6, 6))[0], block("truck", (14, 0, 0), (14, 6, 8))[0]
     assert cut(cab, block("truck", (12, 0, 0), (2, 6, 2))[0], box) == 1  # 11 m: a lorry with a neck
     assert cut(cab, block("truck", (12, 3, 0), (2, 1, 1))[0], box) == 2  # a stray voxel between two
-    far = block("truck", (32, 0, 0), (14, 6, 8))[0]
-    assert cut(box, block("truck", (28, 0, 0), (4, 6, 2))[0], far) == 2  # 13 m: too long for one
+    far = block("truck", (34, 0, 0), (14, 6, 8))[0]
+    assert cut(box, block("truck", (28, 0, 0), (6, 6, 2))[0], far) == 2  # 14 m: too long for one
 
 
 def test_a_rim_that_was_once_seen_through_is_not_left():
