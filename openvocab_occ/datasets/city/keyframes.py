@@ -139,16 +139,18 @@ def _box(thing: Thing, T: np.ndarray, velocity: tuple[float, float], moving: boo
     )  # fmt: skip
 
 
-def labels(drive: Traversal, index: int, instant: Instant | None = None, *, masks: bool = True) -> Labels:
+def labels(
+    drive: Traversal, index: int, instant: Instant | None = None, *, masks: bool = True, quick: bool = False
+) -> Labels:
     """Return the Occ3D labels of a keyframe, in the ego frame at the LiDAR's time.
 
-    Without masks everything counts as known, which saves half of the time.
+    Without masks everything counts as known, which saves half of the time; `quick` is that of `voxelise`.
     """
     instant = instant or instant_of(drive, index)
     T_world_ego = drive.T_world_ego(index * PERIOD)
     T_grid_local = invert(T_world_ego)
     T_grid_local[:3, 3] += T_grid_local[:3, :3] @ instant.surroundings.origin
-    voxels = voxelise(instant.triangles, T_grid_local)
+    voxels = voxelise(instant.triangles, T_grid_local, quick=quick)
     if not masks:
         everything = np.ones(OCC3D_SPEC.shape, np.bool_)
         grid = OccupancyGrid(voxels.semantics, OCC3D_SPEC, T_world_ego, OCC3D_FREE)
@@ -174,8 +176,8 @@ def frame(drive: Traversal, index: int, *, size: tuple[int, int] = (704, 256), d
           ) -> Frame:  # fmt: skip
     """Return a keyframe with images, occupancy and LiDAR; with `depth` also the true depth of every pixel.
 
-    A quick one is for training small models: the world stands still while the cameras fire, edges are not smoothed, and
-    all of the grid counts as known.
+    A quick one is for training small models: the world stands still while the cameras fire, edges are not smoothed,
+    surfaces are sampled less densely, all of the grid counts as known, and there is no LiDAR.
     """
     instant = instant_of(drive, index)
     views, poses = [], {}
@@ -189,8 +191,8 @@ def frame(drive: Traversal, index: int, *, size: tuple[int, int] = (704, 256), d
         timestamp=drive.start_time() + index * PERIOD,
         T_world_ego=T_world_ego,
         views=tuple(views),
-        occupancy=labels(drive, index, instant, masks=not quick).grid,
-        points=transform(T_EGO_LIDAR, sweep(drive, index, instant).points).astype(np.float32),
+        occupancy=labels(drive, index, instant, masks=not quick, quick=quick).grid,
+        points=None if quick else transform(T_EGO_LIDAR, sweep(drive, index, instant).points).astype(np.float32),
         token=f"{drive.name}-{index:03d}",
         poses={**poses, "lidar": T_world_ego @ T_EGO_LIDAR},
     )

@@ -21,7 +21,7 @@ def load_city(
 ) -> FrameSequence:  # fmt: skip
     """Drive through the demo city, two frames a second; see `City.traversal`. Frames are rendered when asked for.
 
-    `quick` frames, for training small models, have no masks and no smooth edges; see `keyframes.frame`.
+    `quick` frames, for training small models, have no masks, no LiDAR and no smooth edges; see `keyframes.frame`.
 
     Raises:
         ConfigError: A root or a scene is given, a number is out of range, or the condition is not known.

@@ -14,7 +14,7 @@ from openvocab_occ.geometry import GridSpec
 from openvocab_occ.occupancy import OCC3D_FREE, OCC3D_SPEC
 
 _CLASSES = OCC3D_FREE  # 0..16
-_SAMPLES = 3.0  # along an edge of a voxel
+_SAMPLES, _FEW_SAMPLES = 3.0, 1.5  # along an edge of a voxel
 _LEAST = 0.012  # m2 of surface that make a voxel occupied
 _FLAT = [LABELS[n] for n in ("driveable surface", "other flat", "sidewalk", "terrain")]
 _SMALL = [LABELS[n] for n in ("bicycle", "motorcycle", "pedestrian", "traffic cone", "barrier")]
@@ -66,14 +66,18 @@ class _Scratch(threading.local):
 _scratch = _Scratch()
 
 
-def voxelise(triangles: Triangles, T_grid_local: Float[np.ndarray, "4 4"], spec: GridSpec = OCC3D_SPEC) -> Voxels:
+def voxelise(
+    triangles: Triangles, T_grid_local: Float[np.ndarray, "4 4"], spec: GridSpec = OCC3D_SPEC, *, quick: bool = False
+) -> Voxels:
     """Label a grid.
 
     Args:
         triangles: Everything around it.
         T_grid_local: Takes the coordinates of the triangles into the grid's frame.
         spec: The lattice; voxels are cubes.
+        quick: Sample surfaces half as densely: 2 % of the occupied voxels come out otherwise, in 60 % of the time.
     """
+    samples = _FEW_SAMPLES if quick else _SAMPLES
     size = float(spec.size[0])
     rotation = T_grid_local[:3, :3] / size
     shift = (T_grid_local[:3, 3] - np.asarray(spec.origin)) / size
@@ -89,7 +93,7 @@ def voxelise(triangles: Triangles, T_grid_local: Float[np.ndarray, "4 4"], spec:
     label, owner, closed = triangles.label, triangles.instance, triangles.solid
 
     def work(x0: int, x1: int) -> None:
-        splat(v, triangles.faces, chosen, label, owner, closed, FILL, WEIGHT, _SAMPLES, x0, x1, area, best, instances,
+        splat(v, triangles.faces, chosen, label, owner, closed, FILL, WEIGHT, samples, x0, x1, area, best, instances,
               crossings)  # fmt: skip
         decide(area, best, crossings, FILL, WEIGHT, _LEAST / size**2, OCC3D_FREE, x0, x1, instances, semantics)
 
