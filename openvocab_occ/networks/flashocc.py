@@ -73,7 +73,7 @@ class FlashOcc(nn.Module):
         return self.img_bev_encoder_neck(self.img_bev_encoder_backbone(bev))
 
     def image_features(self, images: Float[Tensor, "b n 3 h w"]) -> Float[Tensor, "b n c h2 w2"]:
-        """Return features at 1/16 of normalised images."""
+        """Return features at 1/16 (tiny ones at 1/8) of normalised images."""
         flat = images.flatten(0, 1)
         if self.config.public_quirks:
             flat = flat.flip(1)

@@ -1,7 +1,7 @@
 """Networks by name, and frames to logits."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -123,29 +123,8 @@ class OccupancyNetwork:
 
     def prepare(self, frame: Frame) -> tuple[Float[Tensor, "1 n 3 h w"], Rig]:
         """Return normalised images and their rig, as `predict` feeds them."""
-        if not frame.views:
-            raise DataError(f"frame {frame.index} has no views", expected="one image a camera")
-        order = {camera: k for k, camera in enumerate(CAMERA_ORDER)}
-        views = sorted(frame.views, key=lambda view: order.get(view.name, len(order)))
-        key = frame.T_world_ego
-        if self.config.public_quirks:
-            key = frame.poses.get("cam_front_left_ego", key)
-        images: list[np.ndarray] = []
-        moves: list[np.ndarray] = []
-        for view in views:
-            if view.camera.lens != "pinhole":
-                raise DataError(
-                    f"view {view.name!r} is distorted", expected="a pinhole camera", fix="undistort it first"
-                )
-            image, move = fit_image(view.image, self.config.image_size)
-            images.append((image.astype(np.float32) - _MEAN) / _STD)
-            moves.append(move)
-        planes = torch.from_numpy(np.stack(images).astype(np.float32)).permute(0, 3, 1, 2)[None].contiguous()
-        T_ego_cam = np.stack([invert(key) @ view.camera.T_world_cam for view in views])
-        return planes, Rig(
-            K=_batch([view.camera.K for view in views]), T_ego_cam=_batch(list(T_ego_cam)),
-            T_net_image=_batch(moves), T_bev_ego=torch.eye(3)[None],
-        )  # fmt: skip
+        views = fit_views(frame, self.config)
+        return normalise(views.images[None]), views.rig()
 
     def _prior(self, prior: Prior | None, device: torch.device) -> tuple[Tensor, Tensor]:
         shape = (*self.config.shape, self.config.classes)
@@ -156,6 +135,53 @@ class OccupancyNetwork:
                              fix="read it with the network's spec, from a map of the same classes")  # fmt: skip
         logits = torch.from_numpy(np.ascontiguousarray(prior.logits, dtype=np.float32))[None]
         return logits.to(device), torch.from_numpy(np.ascontiguousarray(prior.known, dtype=bool))[None].to(device)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedViews:
+    """Views of a frame as a network takes them, before their colours are normalised."""
+
+    images: UInt8[np.ndarray, "n h w 3"]
+    K: Float32[np.ndarray, "n 3 3"]
+    """Of the original images."""
+    T_ego_cam: Float32[np.ndarray, "n 4 4"]
+    T_net_image: Float32[np.ndarray, "n 3 3"]
+    """Pixel of the original image to pixel here."""
+
+    def rig(self) -> Rig:
+        """Return a batch of one rig."""
+        K, T, move = (torch.from_numpy(a)[None] for a in (self.K, self.T_ego_cam, self.T_net_image))
+        return Rig(K=K, T_ego_cam=T, T_net_image=move, T_bev_ego=torch.eye(3)[None])
+
+
+def fit_views(frame: Frame, config: FlashOccConfig) -> FittedViews:
+    """Order, scale and crop the views of a frame to a network's input.
+
+    Raises:
+        DataError: There are none, or one is distorted.
+    """
+    if not frame.views:
+        raise DataError(f"frame {frame.index} has no views", expected="one image a camera")
+    order = {camera: k for k, camera in enumerate(CAMERA_ORDER)}
+    views = sorted(frame.views, key=lambda view: order.get(view.name, len(order)))
+    key = frame.T_world_ego
+    if config.public_quirks:
+        key = frame.poses.get("cam_front_left_ego", key)
+    for view in views:
+        if view.camera.lens != "pinhole":
+            raise DataError(f"view {view.name!r} is distorted", expected="a pinhole camera", fix="undistort it first")
+    fitted = [fit_image(view.image, config.image_size) for view in views]
+    T_ego_cam = [invert(key) @ view.camera.T_world_cam for view in views]
+    return FittedViews(
+        np.stack([image for image, _ in fitted]), _stack([view.camera.K for view in views]), _stack(T_ego_cam),
+        _stack([move for _, move in fitted]),
+    )  # fmt: skip
+
+
+def normalise(images: UInt8[np.ndarray, "b n h w 3"]) -> Float[Tensor, "b n 3 h w"]:
+    """Return RGB images about the mean, in standard deviations (ImageNet's)."""
+    planes = (images.astype(np.float32) - np.float32(_MEAN)) / np.float32(_STD)
+    return torch.from_numpy(planes).permute(0, 1, 4, 2, 3).contiguous()
 
 
 def fit_image(
@@ -174,5 +200,5 @@ def fit_image(
     return np.ascontiguousarray(small[top : top + size[0], left : left + size[1]]), move
 
 
-def _batch(matrices: Sequence[np.ndarray]) -> Tensor:
-    return torch.from_numpy(np.stack(matrices).astype(np.float32))[None]
+def _stack(matrices: Sequence[np.ndarray]) -> Float32[np.ndarray, "n a b"]:
+    return np.stack(matrices).astype(np.float32)

@@ -174,8 +174,8 @@ def frame(drive: Traversal, index: int, *, size: tuple[int, int] = (704, 256), d
           ) -> Frame:  # fmt: skip
     """Return a keyframe with images, occupancy and LiDAR; with `depth` also the true depth of every pixel.
 
-    A quick one is for training small models: the world stands still while the cameras fire, edges are not smoothed, and
-    all of the grid counts as known.
+    A quick one is for training small models: the world stands still while the cameras fire, edges are not smoothed, all
+    of the grid counts as known, and the LiDAR does not turn.
     """
     instant = instant_of(drive, index)
     views, poses = [], {}
@@ -190,7 +190,7 @@ def frame(drive: Traversal, index: int, *, size: tuple[int, int] = (704, 256), d
         T_world_ego=T_world_ego,
         views=tuple(views),
         occupancy=labels(drive, index, instant, masks=not quick).grid,
-        points=transform(T_EGO_LIDAR, sweep(drive, index, instant).points).astype(np.float32),
+        points=None if quick else transform(T_EGO_LIDAR, sweep(drive, index, instant).points).astype(np.float32),
         token=f"{drive.name}-{index:03d}",
         poses={**poses, "lidar": T_world_ego @ T_EGO_LIDAR},
     )
