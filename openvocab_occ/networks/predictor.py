@@ -15,7 +15,7 @@ from openvocab_occ.geometry import GridSpec, invert
 from openvocab_occ.io.files import PathLike
 from openvocab_occ.networks.checkpoint import LoadReport, load_public_checkpoint
 from openvocab_occ.networks.dhd import DHD_S, Dhd
-from openvocab_occ.networks.flashocc import M0, M1, TINY, FlashOcc, FlashOccConfig
+from openvocab_occ.networks.flashocc import M0, M1, MICRO, TINY, FlashOcc, FlashOccConfig
 from openvocab_occ.networks.fusion import FusionKind
 from openvocab_occ.networks.lift_splat import Rig
 from openvocab_occ.networks.lmop import Lmop
@@ -25,6 +25,7 @@ NETWORKS: dict[str, tuple[type[FlashOcc], FlashOccConfig]] = {
     "flashocc-m1": (FlashOcc, M1),
     "dhd-s": (Dhd, DHD_S),
     "flashocc-tiny": (FlashOcc, TINY),
+    "flashocc-micro": (FlashOcc, MICRO),
     "dhd-tiny": (Dhd, TINY),
 }
 CAMERA_ORDER = ("CAM_FRONT_LEFT", "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_LEFT", "CAM_BACK", "CAM_BACK_RIGHT")
@@ -53,7 +54,7 @@ def load_network(
 
     Args:
         name: `flashocc-m0`, `flashocc-m1`, `dhd-s` (256 x 704 images, 0.4 m voxels of Occ3D), `flashocc-tiny` or
-            `dhd-tiny` (48 x 128, 0.8 m).
+            `dhd-tiny` (48 x 128, 0.8 m), `flashocc-micro` (those within 20 m).
         weights: A checkpoint of ours or a public one; without it the weights are random and its predictions noise.
         memory: Wrap it with a memory prior (LMPOcc).
         fusion: How prior and current feature are fused.

@@ -13,9 +13,10 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 from openvocab_occ.datasets.frame import FrameSequence
 from openvocab_occ.datasets.registry import load_sequence
 from openvocab_occ.errors import ConfigError, DataError
+from openvocab_occ.geometry import GridSpec
 from openvocab_occ.io.files import PathLike, existing, written_file
 from openvocab_occ.networks.flashocc import FlashOccConfig
-from openvocab_occ.training.samples import CameraMasks, sample_of
+from openvocab_occ.training.samples import CameraMasks, Sample, crop, network_spec, sample_of
 
 Advance = Callable[[int, int], None]
 _ARRAYS = ("images", "K", "T_ego_cam", "T_net_image", "labels", "mask", "poses", "stamps", "origins")
@@ -40,9 +41,12 @@ class DriveInfo:
 
 
 class Drive:
-    """Frames of a drive as arrays; read from the file when first asked for."""
+    """Frames of a drive as arrays; read from the file when first asked for.
 
-    def __init__(self, path: PathLike) -> None:
+    With `spec` labels and masks are cut to the grid of a network that sees less far than the labels reach.
+    """
+
+    def __init__(self, path: PathLike, spec: GridSpec | None = None) -> None:
         self.path = existing(path, "drive")
         try:
             with np.load(self.path, allow_pickle=False) as content:
@@ -54,10 +58,12 @@ class Drive:
         except Exception as error:  # a damaged zip raises many kinds
             raise DataError(f"{self.path.name} is damaged", got=type(error).__name__,
                             fix="remove it; it is made anew") from error  # fmt: skip
-        if missing or meta.pop("format", None) != _FORMAT:
+        if missing or meta.pop("format", None) != _FORMAT or not {"lower", "cell"} <= meta.keys():
             raise DataError(f"{self.path.name} is not a drive of this version", expected=", ".join(_ARRAYS),
                             got=f"without {', '.join(missing)}" if missing else "another format",
                             fix="remove it; it is made anew")  # fmt: skip
+        self._lower, self._cell = meta.pop("lower"), meta.pop("cell")
+        self._spec = spec
         self.info = DriveInfo(**meta)
 
     @cached_property
@@ -66,6 +72,10 @@ class Drive:
             found = {name: content[name] for name in _ARRAYS}
         shape = found["labels"].shape
         found["mask"] = np.unpackbits(found["mask"], axis=-1, count=shape[-1]).astype(np.bool_)
+        if self._spec is not None:
+            x, y, z = crop(GridSpec(tuple(self._lower), self._cell, shape[1:]), self._spec)
+            for name in ("labels", "mask"):
+                found[name] = np.ascontiguousarray(found[name][:, x, y, z])
         return found
 
     def __len__(self) -> int:
@@ -77,7 +87,9 @@ class Drive:
         return self._content["images"]
 
     @property
-    def rigs(self) -> tuple[Float32[np.ndarray, "f n 3 3"], Float32[np.ndarray, "f n 4 4"], Float32[np.ndarray, "f n 3 3"]]:
+    def rigs(
+        self,
+    ) -> tuple[Float32[np.ndarray, "f n 3 3"], Float32[np.ndarray, "f n 4 4"], Float32[np.ndarray, "f n 3 3"]]:
         """K, T_ego_cam and T_net_image of each frame."""
         return self._content["K"], self._content["T_ego_cam"], self._content["T_net_image"]
 
@@ -108,15 +120,26 @@ class Drive:
 
 
 def write_drive(
-    path: PathLike, sequence: FrameSequence, info: DriveInfo, config: FlashOccConfig, *, masks: CameraMasks | None = None
+    path: PathLike,
+    sequence: FrameSequence,
+    info: DriveInfo,
+    config: FlashOccConfig,
+    *,
+    masks: CameraMasks | None = None,
 ) -> Drive:
     """Make samples of all frames of a drive and keep them in a file, whole or not at all."""
-    found = [sample_of(frame, config, masks=masks) for frame in sequence]
+    found: list[Sample] = []
+    lowest = None
+    for frame in sequence:
+        found.append(sample_of(frame, config, masks=masks))
+        lowest = frame.occupancy.spec.origin if frame.occupancy is not None else lowest
     if not found:
         raise DataError(f"drive {info.name} has no frames", expected="1 or more")
     if len({sample.views.images.shape for sample in found}) > 1:
-        raise DataError(f"frames of {info.name} differ in their cameras", expected="the same number of views in each",
-                        got=sorted({len(s.views.images) for s in found}), fix="leave incomplete frames out")  # fmt: skip
+        raise DataError(
+            f"frames of {info.name} differ in their cameras", expected="the same number of views in each",
+            got=sorted({len(s.views.images) for s in found}), fix="leave incomplete frames out",
+        )  # fmt: skip
     arrays = {
         "images": [s.views.images for s in found], "K": [s.views.K for s in found],
         "T_ego_cam": [s.views.T_ego_cam for s in found], "T_net_image": [s.views.T_net_image for s in found],
@@ -125,9 +148,10 @@ def write_drive(
         "origins": [s.origin for s in found],
     }  # fmt: skip
     with written_file(path) as scratch, scratch.open("wb") as stream:
-        meta = json.dumps({"format": _FORMAT, **asdict(info)})
+        lower = list(map(float, lowest or (0.0, 0.0, 0.0)))
+        meta = json.dumps({"format": _FORMAT, "lower": lower, "cell": config.cell, **asdict(info)})
         np.savez_compressed(stream, meta=np.array(meta), **{name: np.stack(a) for name, a in arrays.items()})
-    return Drive(path)
+    return Drive(path, network_spec(config))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,7 +198,7 @@ def city_drives(
         if not path.exists():
             frames = load_sequence("city", size=(width, height), quick=True, frames=plan.frames * plan.every, **options)
             write_drive(path, frames[:: plan.every], info, config)
-        found.append(Drive(path))
+        found.append(Drive(path, network_spec(config)))
         if progress is not None:
             progress(done + 1, len(wanted))
     return found

@@ -1,4 +1,4 @@
-"""What a run leaves behind: lines of JSON, TensorBoard where it is installed, checkpoints that replace each other whole."""
+"""What a run leaves behind: lines of JSON, TensorBoard where it is installed, and checkpoints."""
 
 import json
 import time

@@ -1,11 +1,11 @@
 """Train a baseline: AdamW, warm-up, moving average of the weights, resumable to the bit."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Iterator, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -53,7 +53,9 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         if min(self.steps, self.batch, self.save_every) < 1 or self.rate <= 0 or not 0 <= self.ema < 1:
-            raise ConfigError("training cannot be done", expected="steps, batch and rate above 0, 0 <= ema < 1", got=self)
+            raise ConfigError(
+                "training cannot be done", expected="steps, batch and rate above 0, 0 <= ema < 1", got=self
+            )
 
 
 def train_baseline(

@@ -34,7 +34,7 @@ class Sample:
 
 
 def sample_of(frame: Frame, config: FlashOccConfig, *, masks: CameraMasks | None = None) -> Sample:
-    """Make a sample of a frame with occupancy; its grid is pooled to the network's voxels.
+    """Make a sample of a frame with occupancy; its whole grid is pooled to voxels of the network's size.
 
     Raises:
         DataError: The frame has no views, or its images are blank or of too little size.
@@ -43,7 +43,7 @@ def sample_of(frame: Frame, config: FlashOccConfig, *, masks: CameraMasks | None
     if frame.occupancy is None:
         raise GridError(f"frame {frame.index} has no occupancy", expected="labels to learn from")
     check_images(frame, config)
-    grid = pool_grid(frame.occupancy, network_spec(config))
+    grid = pool_grid(frame.occupancy, _pooled_spec(frame.occupancy.spec, config.cell))
     seen = None if masks is None else masks(frame)
     if seen is None:
         seen = visibility_mask(grid, [view.camera for view in frame.views], mode="pixel", stride=_stride(frame))
@@ -124,6 +124,29 @@ def spread(labels: UInt8[np.ndarray, "x y z"], factor: int) -> UInt8[np.ndarray,
     for axis in range(3):
         labels = labels.repeat(factor, axis=axis)
     return labels
+
+
+def crop(spec: GridSpec, inner: GridSpec) -> tuple[slice, slice, slice]:
+    """Return which voxels of a grid make up an inner one with voxels of the same size.
+
+    Raises:
+        GridError: It does not lie inside, or between the voxels.
+    """
+    start = (np.asarray(inner.origin) - np.asarray(spec.origin)) / spec.size
+    first = np.round(start).astype(int)
+    ends = first + inner.shape
+    fits = np.allclose(spec.size, inner.size, atol=_SAME) and np.allclose(start, first, atol=1e-3)
+    if not fits or (first < 0).any() or (ends > spec.shape).any():
+        raise GridError("the labels do not cover the network's grid", expected=inner, got=spec,
+                        fix="make the drives anew for this network")  # fmt: skip
+    x, y, z = (slice(int(a), int(b)) for a, b in zip(first, ends, strict=True))
+    return x, y, z
+
+
+def _pooled_spec(spec: GridSpec, cell: float) -> GridSpec:
+    factor = round(cell / float(spec.size[0]))
+    shape = tuple(n // max(factor, 1) for n in spec.shape)
+    return GridSpec(spec.origin, (cell, cell, cell), (shape[0], shape[1], shape[2]))
 
 
 def _blocks(array: np.ndarray, factor: int) -> np.ndarray:
