@@ -58,21 +58,20 @@ def run(scale: Scale, out: Path, *, device: str = "cpu", tell: Tell = print) -> 
 def _ground(name: str, scale: Scale, out: Path, device: str, tell: Tell) -> Ground:
     torch.manual_seed(scale.base.seed)
     network = load_network(name, device=device)
-    found: list[list[Drive]] = []
-    for what, plan in (("train", scale.train), ("test", scale.test)):
-        tell(f"{name}: drives of {what}")
-        found.append(city_drives(plan, network.config, out / "drives"))
+    tell(f"{name}: drives to train on")
+    train = city_drives(scale.train, network.config, out / "drives")
     weights = out / name / "base" / FINAL
     config = replace(scale.base, loss="dhd" if name.startswith("dhd") else "flashocc")
     if not weights.exists():
         tell(f"{name}: baseline, {config.steps} steps")
-        train_baseline(network, found[0], weights.parent, config, progress=_every(tell, name))
+        train_baseline(network, train, weights.parent, config, progress=_every(tell, name))
     network = load_network(name, weights, device=device)
-    tell(f"{name}: latents")
+    tell(f"{name}: drives to test on, and latents")
+    test = city_drives(scale.test, network.config, out / "drives")
     module = network.module
     if isinstance(module, Lmop):
         raise TypeError("a baseline has no memory")
-    return Ground(network, weights, *found, cache_latents(module, [*found[0], *found[1]], out / name / "latents"))
+    return Ground(network, weights, train, test, cache_latents(module, [*train, *test], out / name / "latents"))
 
 
 def _train(weights: Weights, ground: Ground, scale: Scale, home: Path, seed: int, device: str, tell: Tell) -> Path:

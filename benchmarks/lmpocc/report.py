@@ -88,7 +88,7 @@ def numbers(rows: dict[str, Seeds]) -> dict[str, Any]:
 def tables(rows: dict[str, Seeds], found: dict[str, Any]) -> list[str]:
     """Return Markdown."""
     text = [
-        "mIoU in percent, camera mask, all visits but the first, mean over seeds; with and without prior of other logs:",
+        "mIoU in percent, camera mask, visits after the first, mean of seeds; with and without a prior of other logs:",
         "", "| | all | dynamic | static | geometric | with prior | without |", "|---|---|---|---|---|---|---|",
     ]  # fmt: skip
     for way, v in found["ways"].items():

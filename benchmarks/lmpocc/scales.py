@@ -29,9 +29,10 @@ SMOKE = Scale(
 )  # fmt: skip
 REDUCED = Scale(
     networks=("flashocc-micro",),
-    train=CityPlan(cities=(100, 101, 102, 103, 104, 105), visits=3, frames=10, every=3),
-    test=CityPlan(cities=(900, 901, 902, 903), visits=3, frames=10, every=3),
-    base=TrainConfig(steps=600, batch=4), memory=TrainConfig(steps=120, batch=6, rate=1e-3, warm_up=10, flip=False),
+    train=CityPlan(cities=(100, 101, 102, 103), visits=3, frames=10, every=3),
+    test=CityPlan(cities=(900, 901, 902), visits=3, frames=10, every=3),
+    base=TrainConfig(steps=150, batch=4, warm_up=20, save_every=25),
+    memory=TrainConfig(steps=80, batch=4, rate=1e-3, warm_up=10, flip=False),
 )  # fmt: skip
 CORE = Scale(
     train=CityPlan(cities=tuple(range(100, 116))), test=CityPlan(cities=tuple(range(900, 908))), memory=_MEMORY,

@@ -13,7 +13,7 @@ from openvocab_occ.datasets.frame import Frame
 from openvocab_occ.errors import ConfigError, DataError, ModelError, ShapeError
 from openvocab_occ.geometry import GridSpec, invert
 from openvocab_occ.io.files import PathLike
-from openvocab_occ.networks.checkpoint import LoadReport, load_public_checkpoint
+from openvocab_occ.networks.checkpoint import LoadReport, fill, read_checkpoint
 from openvocab_occ.networks.dhd import DHD_S, Dhd
 from openvocab_occ.networks.flashocc import M0, M1, MICRO, TINY, FlashOcc, FlashOccConfig
 from openvocab_occ.networks.fusion import FusionKind
@@ -69,31 +69,40 @@ def load_network(
         config = replace(config, public_quirks=True)
     baseline = kind(config)
     network = Lmop(baseline, fusion=fusion) if memory else baseline
-    report = None
+    report, cameras = None, None
     if weights is not None:
-        report = load_public_checkpoint(network if not memory or _is_memory(weights) else baseline, weights)
-        if isinstance(network, Lmop) and not _is_memory(weights):
+        content = read_checkpoint(weights)
+        whole = any(name.startswith("fusion.") for name in content.state)
+        report = fill(network if not memory or whole else baseline, content.state)
+        cameras = content.cameras
+        if isinstance(network, Lmop) and not whole:
             network.occ_head.load_state_dict(baseline.occ_head.state_dict())
-    return OccupancyNetwork(name, network.to(device).eval(), config, report)
+    return OccupancyNetwork(name, network.to(device).eval(), config, report, cameras)
 
 
-def _is_memory(weights: PathLike) -> bool:
-    content = torch.load(weights, map_location="cpu", weights_only=True)
-    state = content.get("state_dict", content)
-    return any(name.startswith(("fusion.", "module.fusion.")) for name in state)
+def has_memory(weights: PathLike) -> bool:
+    """Tell whether a checkpoint is of a network with memory."""
+    return any(name.startswith("fusion.") for name in read_checkpoint(weights).state)
 
 
 class OccupancyNetwork:
     """A network with what surrounds it: image preparation, device, and the grid it predicts."""
 
     def __init__(
-        self, name: str, module: FlashOcc | Lmop, config: FlashOccConfig, report: LoadReport | None = None
+        self,
+        name: str,
+        module: FlashOcc | Lmop,
+        config: FlashOccConfig,
+        report: LoadReport | None = None,
+        cameras: int | None = None,
     ) -> None:
         self.name = name
         self.module = module
         self.config = config
         self.report = report
         """How the checkpoint's names met the network's; None without one."""
+        self.cameras = cameras
+        """Views that it was trained with, where the checkpoint says so."""
 
     @property
     def spec(self) -> GridSpec:

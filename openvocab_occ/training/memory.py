@@ -16,10 +16,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from openvocab_occ.errors import ConfigError, DataError
-from openvocab_occ.evaluation.occupancy import OccupancyScore
+from openvocab_occ.evaluation.occupancy import OccupancyScore, RayScore
 from openvocab_occ.io.files import PathLike
 from openvocab_occ.networks.lmop import Lmop
 from openvocab_occ.networks.predictor import OccupancyNetwork
+from openvocab_occ.occupancy import OccupancyGrid
 from openvocab_occ.training.drives import Drive
 from openvocab_occ.training.latents import Latents
 from openvocab_occ.training.loop import Run, TrainConfig, class_weights, loss_of, rate_at, told_of_memory
@@ -125,6 +126,23 @@ class MemoryScore:
         for name, region in regions.items():
             scores[name].add(predicted, truth, region)
 
+    def total(self, region: str, condition: str | None = None) -> OccupancyScore:
+        """Add up all places and visits, or those of a condition."""
+        found = OccupancyScore()
+        for (_, _, name), scores in self.parts.items():
+            if condition in (None, name):
+                found.confusion += scores[region].confusion
+        return found
+
+    def summary(self) -> dict[str, object]:
+        """Return the rows of a report, percent."""
+        conditions = sorted({condition for _, _, condition in self.parts if condition})
+        return {
+            "seen": self.total("seen").to_dict(), "with_prior": self.total("covered").to_dict(),
+            "without_prior": self.total("uncovered").to_dict(),
+            "by_condition": {name: self.total("seen", name).to_dict() for name in conditions},
+        }  # fmt: skip
+
     def to_dict(self) -> list[dict[str, object]]:
         """Return plain rows; confusions as lists of counts."""
         return [
@@ -135,6 +153,19 @@ class MemoryScore:
 
 
 REGIONS = ("seen", "covered", "uncovered", "hidden", "hidden_covered")
+
+
+class RayCounter:
+    """Counts RayIoU of what is predicted, from the LiDAR's place in each frame."""
+
+    def __init__(self, network: OccupancyNetwork) -> None:
+        self.spec = network.spec
+        self.score = RayScore()
+
+    def __call__(self, visit: Visit, labels: np.ndarray) -> None:
+        """Count a frame."""
+        truth = OccupancyGrid(visit.drive.labels[visit.frame], self.spec)
+        self.score.add(OccupancyGrid(labels, self.spec), truth, visit.drive.origins[visit.frame][None])
 
 
 @torch.no_grad()
@@ -148,6 +179,7 @@ def evaluate_memory(
     seed: int = 0,
     writer: Writer | None = None,
     blind: bool = False,
+    observer: Callable[[Visit, np.ndarray], None] | None = None,
     progress: Advance | None = None,
 ) -> MemoryScore:
     """Drive through places in the order of their visits with maps that begin empty, and count what is predicted.
@@ -161,6 +193,7 @@ def evaluate_memory(
         seed: Of pose noise.
         writer: Gives the logits that are written in place of the network's own: a prior of another model.
         blind: Give the network an empty prior all the same: a control that is judged in the same regions.
+        observer: Told of the labels of each frame.
         progress: Told of frames.
     """
     module = network.module.eval()
@@ -185,6 +218,8 @@ def evaluate_memory(
         labels = found.argmax(axis=-1).astype(np.uint8)
         for b, v in enumerate(visits):
             score.add(v, labels[b], known[b])
+            if observer is not None:
+                observer(v, labels[b])
         if isinstance(module, Lmop) and memory.prior_from != "none":
             told = found if writer is None else writer(visits)
             write_back(visits, told, network, memory, own=memory.prior_from == "own_log")
