@@ -47,6 +47,7 @@ COMMANDS = {
     "memory export": Command("memory:export", "draw a map, or write its voxels to a file"),
     "crowdsource": Command("crowdsource:crowdsource", "let agents drive concurrently into one map"),
     "bench memory": Command("bench_memory:memory", "measure the global map"),
+    "bench fusion": Command("bench_fusion:fusion", "time the fusion of prior and present beside Neural Map Prior's"),
     "eval keyframe": Command("evaluate:keyframe", "judge depth and answers by the LiDAR of a real keyframe"),
     "bench depth": Command("bench:depth", "time depth images beside other ways to them"),
     "bench surface": Command("bench:surface", "judge voxel and smooth depth by three synthetic meshes"),

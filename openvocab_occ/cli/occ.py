@@ -100,6 +100,7 @@ def train(
     """
     import torch
 
+    from openvocab_occ.networks.lmop import Lmop
     from openvocab_occ.networks.predictor import load_network
     from openvocab_occ.training.latents import cache_latents
     from openvocab_occ.training.loop import TrainConfig, train_baseline
@@ -118,7 +119,8 @@ def train(
         if base is None:
             weights = train_baseline(net, flat, out, config, progress=advance)
         else:
-            latents = cache_latents(net.module.baseline, flat, out / "latents")
+            baseline = net.module.baseline if isinstance(net.module, Lmop) else net.module
+            latents = cache_latents(baseline, flat, out / "latents")
             memory = MemoryConfig(prior_from=prior_from, mask_from=mask_from, dynamic=dynamic)
             weights = train_memory(
                 net, places, latents, out, config, memory=memory, head_only=head_only, progress=advance

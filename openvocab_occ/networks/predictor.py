@@ -37,8 +37,15 @@ _MEAN, _STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
 class Prior(Protocol):
     """What memory knows of a window; the record that a tile map's `read` returns."""
 
-    logits: Float32[np.ndarray, "x y z classes"]
-    known: Bool[np.ndarray, "x y z"]
+    @property
+    def logits(self) -> Float32[np.ndarray, "x y z classes"]:
+        """Class-centred log-probabilities, 0 where not known."""
+        ...
+
+    @property
+    def known(self) -> Bool[np.ndarray, "x y z"]:
+        """Which voxels the map has seen."""
+        ...
 
 
 def load_network(
@@ -105,6 +112,11 @@ class OccupancyNetwork:
         """Views that it was trained with, where the checkpoint says so."""
 
     @property
+    def memory(self) -> bool:
+        """Whether it reads a prior."""
+        return isinstance(self.module, Lmop)
+
+    @property
     def spec(self) -> GridSpec:
         """The grid of its logits, in the ego frame."""
         return GridSpec(self.config.lower, self.config.cell, self.config.shape)
@@ -129,7 +141,11 @@ class OccupancyNetwork:
         except torch.OutOfMemoryError as error:
             raise ModelError(f"{self.name} does not fit into the memory of {device}", got=str(error).splitlines()[0],
                              fix="choose a smaller network or device='cpu'") from error  # fmt: skip
-        return logits[0].float().cpu().numpy()
+        found = logits[0].float().cpu().numpy()
+        if not np.isfinite(found).all():
+            raise ModelError(f"{self.name} gives no numbers for frame {frame.index}", expected="finite logits",
+                             fix="look at the weights, and at K and poses of the cameras")  # fmt: skip
+        return found
 
     def prepare(self, frame: Frame) -> tuple[Float[Tensor, "1 n 3 h w"], Rig]:
         """Return normalised images and their rig, as `predict` feeds them."""
@@ -190,7 +206,7 @@ def fit_views(frame: Frame, config: FlashOccConfig) -> FittedViews:
 
 def normalise(images: UInt8[np.ndarray, "b n h w 3"]) -> Float[Tensor, "b n 3 h w"]:
     """Return RGB images about the mean, in standard deviations (ImageNet's)."""
-    planes = (images.astype(np.float32) - np.float32(_MEAN)) / np.float32(_STD)
+    planes = (images.astype(np.float32) - np.array(_MEAN, np.float32)) / np.array(_STD, np.float32)
     return torch.from_numpy(planes).permute(0, 1, 4, 2, 3).contiguous()
 
 

@@ -49,7 +49,7 @@ class Drive:
     def __init__(self, path: PathLike, spec: GridSpec | None = None) -> None:
         self.path = existing(path, "drive")
         try:
-            with np.load(self.path, allow_pickle=False) as content:
+            with self.path.open("rb") as stream, np.load(stream, allow_pickle=False) as content:
                 meta: dict[str, Any] = json.loads(str(content["meta"]))
                 missing = [name for name in _ARRAYS if name not in content.files]
         except (ValueError, OSError, KeyError, EOFError) as error:
@@ -73,7 +73,10 @@ class Drive:
         shape = found["labels"].shape
         found["mask"] = np.unpackbits(found["mask"], axis=-1, count=shape[-1]).astype(np.bool_)
         if self._spec is not None:
-            x, y, z = crop(GridSpec(tuple(self._lower), self._cell, shape[1:]), self._spec)
+            lower = self._lower
+            x, y, z = crop(
+                GridSpec((lower[0], lower[1], lower[2]), self._cell, (shape[1], shape[2], shape[3])), self._spec
+            )
             for name in ("labels", "mask"):
                 found[name] = np.ascontiguousarray(found[name][:, x, y, z])
         return found
@@ -150,7 +153,8 @@ def write_drive(
     with written_file(path) as scratch, scratch.open("wb") as stream:
         lower = list(map(float, lowest or (0.0, 0.0, 0.0)))
         meta = json.dumps({"format": _FORMAT, "lower": lower, "cell": config.cell, **asdict(info)})
-        np.savez_compressed(stream, meta=np.array(meta), **{name: np.stack(a) for name, a in arrays.items()})
+        content: dict[str, Any] = {name: np.stack(a) for name, a in arrays.items()}
+        np.savez_compressed(stream, meta=np.array(meta), **content)
     return Drive(path, network_spec(config))
 
 

@@ -14,7 +14,7 @@ from openvocab_occ.geometry import Camera
 from openvocab_occ.io.files import PathLike, written_file
 from openvocab_occ.memory import TileMap
 from openvocab_occ.memory.filters import remove_dynamic
-from openvocab_occ.networks.lmop import Lmop
+from openvocab_occ.networks.onnx_network import OnnxNetwork
 from openvocab_occ.networks.predictor import OccupancyNetwork
 from openvocab_occ.occupancy import OCC3D_CLASSES, OCC3D_SPEC, OccupancyGrid, visibility_mask
 from openvocab_occ.training.samples import check_images, spread
@@ -35,7 +35,7 @@ class MapUse:
     write: bool = True
 
 
-def open_map(path: PathLike, network: OccupancyNetwork) -> TileMap:
+def open_map(path: PathLike, network: OccupancyNetwork | OnnxNetwork) -> TileMap:
     """Open the map of a network's lattice, or create it.
 
     Raises:
@@ -50,7 +50,7 @@ def open_map(path: PathLike, network: OccupancyNetwork) -> TileMap:
     return city
 
 
-def check_map(city: TileMap, network: OccupancyNetwork) -> None:
+def check_map(city: TileMap, network: OccupancyNetwork | OnnxNetwork) -> None:
     """Refuse a map whose priors would mean something else to a network.
 
     Raises:
@@ -66,7 +66,7 @@ def check_map(city: TileMap, network: OccupancyNetwork) -> None:
 
 
 def predictions(
-    network: OccupancyNetwork,
+    network: OccupancyNetwork | OnnxNetwork,
     sequence: FrameSequence,
     city: TileMap | None = None,
     use: MapUse | None = None,
@@ -76,7 +76,7 @@ def predictions(
     """Yield each frame with the logits of a network, which reads the map before it writes what the cameras saw of them.
 
     Args:
-        network: With memory if a map is to be read; a baseline only writes.
+        network: With memory if a map is to be read; a baseline, or a foreign ONNX model, only writes.
         sequence: The drive.
         city: The global map.
         use: How; needed with a map.
@@ -94,7 +94,7 @@ def predictions(
     for frame in sequence:
         check_images(frame, network.config, cameras=cameras)
         prior = None
-        if city is not None and use is not None and isinstance(network.module, Lmop):
+        if city is not None and use is not None and network.memory:
             gone = (use.log,) if use.prior_from == "other_logs" and use.log in city.logs() else ()
             prior = city.read(frame.T_world_ego, spec, exclude_logs=gone)
         logits = network.predict(frame, prior)
@@ -112,7 +112,7 @@ def predictions(
 
 
 def write_predictions(
-    network: OccupancyNetwork,
+    network: OccupancyNetwork | OnnxNetwork,
     sequence: FrameSequence,
     out: PathLike,
     city: TileMap | None = None,
@@ -137,7 +137,7 @@ def write_predictions(
 
 
 def occ3d_labels(
-    logits: Float32[np.ndarray, "x y z classes"], network: OccupancyNetwork
+    logits: Float32[np.ndarray, "x y z classes"], network: OccupancyNetwork | OnnxNetwork
 ) -> UInt8[np.ndarray, "200 200 16"]:
     """Return the likeliest classes on Occ3D's lattice; free where the network's grid does not reach.
 

@@ -116,7 +116,7 @@ def pool_labels(labels: UInt8[np.ndarray, "x y z"], factor: int, free: int) -> U
 
 def pool_any(mask: Bool[np.ndarray, "x y z"], factor: int) -> Bool[np.ndarray, "x2 y2 z2"]:
     """Tell which blocks have a voxel in the mask."""
-    return _blocks(mask, factor).any(axis=-1)
+    return np.asarray(_blocks(mask, factor).any(axis=-1))
 
 
 def spread(labels: UInt8[np.ndarray, "x y z"], factor: int) -> UInt8[np.ndarray, "x2 y2 z2"]:

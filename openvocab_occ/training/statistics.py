@@ -35,16 +35,21 @@ class Outcome:
     confusion: Int64[np.ndarray, "seeds cities truth predicted"]
     cities: tuple[str, ...]
 
-    def values(self, classes: Collection[int], weights: Float64[np.ndarray, "seeds cities"] | None = None
-               ) -> Float64[np.ndarray, " seeds"]:  # fmt: skip
-        """Return the mean IoU of classes for each seed, percent, cities weighing as told."""
-        weight = np.ones(self.confusion.shape[:2]) if weights is None else weights
-        total = np.einsum("scij,sc->sij", self.confusion, weight)
-        hit = np.einsum("sii->si", total)
-        union = total.sum(1) + total.sum(2) - hit
-        with np.errstate(invalid="ignore", divide="ignore"):
-            iou = np.where(union > 0, hit / union, np.nan)[:, sorted(classes)]
-        return 100 * np.nanmean(iou, axis=1)
+    def values(self, classes: Collection[int]) -> Float64[np.ndarray, " seeds"]:
+        """Return the mean IoU of classes for each seed, percent."""
+        return self.draws(classes, np.ones((1, len(self.cities))))[0]
+
+    def draws(
+        self, classes: Collection[int], weights: Float64[np.ndarray, "draws cities"]
+    ) -> Float64[np.ndarray, "draws seeds"]:
+        """Return the mean IoU of classes for each seed, percent, once for each row of weights of the cities."""
+        c = sorted(classes)
+        hit = np.einsum("scii->sci", self.confusion)[..., c]
+        union = self.confusion.sum(2)[..., c] + self.confusion.sum(3)[..., c] - hit
+        hits, unions = (np.einsum("dc,sck->dsk", weights, x.astype(np.float64)) for x in (hit, union))
+        iou = np.where(unions > 0, hits / np.maximum(unions, 1), np.nan)
+        count = np.isfinite(iou).sum(axis=-1)
+        return 100 * np.where(count > 0, np.nansum(iou, axis=-1) / np.maximum(count, 1), np.nan)
 
     @property
     def geometric(self) -> float:
@@ -92,13 +97,10 @@ def gain(a: Outcome, b: Outcome, group: str = "all", *, draws: int = _DRAWS, see
     seeds, cities = max(len(a.confusion), len(b.confusion)), len(a.cities)
     if not classes or a.cities != b.cities:
         return Interval(float("nan"), float("nan"), float("nan"))
-    a, b = (Outcome(np.broadcast_to(o.confusion, (seeds, *o.confusion.shape[1:])), o.cities) for o in (a, b))
     rng = np.random.default_rng(seed)
-    found = np.empty(draws)
-    for n in range(draws):
-        weight = np.bincount(rng.integers(cities, size=cities), minlength=cities).astype(np.float64)
-        weights = np.broadcast_to(weight, (seeds, cities))
-        difference = a.values(classes, weights) - b.values(classes, weights)
-        found[n] = difference[rng.integers(seeds, size=seeds)].mean()
-    low, high = np.nanpercentile(found, [2.5, 97.5])
+    towns = rng.multinomial(cities, np.full(cities, 1 / cities), size=draws).astype(np.float64)
+    runs = rng.multinomial(seeds, np.full(seeds, 1 / seeds), size=draws) / seeds
+    difference = a.draws(classes, towns) - b.draws(classes, towns)  # draws, seeds
+    found = (np.broadcast_to(difference, (draws, seeds)) * runs).sum(axis=1)
+    low, high = np.nanpercentile(found, [2.5, 97.5]) if np.isfinite(found).any() else (np.nan, np.nan)
     return Interval(float((a.values(classes) - b.values(classes)).mean()), float(low), float(high))

@@ -56,7 +56,7 @@ class StreamMap:
     def read(self, T_world_ego: Float[np.ndarray, "4 4"]) -> StreamPrior:
         """Return the window at a pose: of each grid column the map column that holds its centre."""
         X, Y, Z = self.spec.shape
-        x, y = self._centers(self.spec.origin[:2], (X, Y))
+        x, y = self._centers(np.asarray(self.spec.origin)[:2], (X, Y))
         R, t = T_world_ego[:2, :2], T_world_ego[:2, 3]
         place = np.floor((np.stack([x, y], -1) @ R.T + t) / self.cell).astype(np.int64) - self._first
         inside = ((place >= 0) & (place < self.shape)).all(axis=-1)
