@@ -47,8 +47,9 @@ def export_onnx(network: OccupancyNetwork, path: PathLike, *, cameras: int = 6) 
     """
     config = network.config
     height, width = config.image_size
-    eye3, eye4 = (torch.eye(n).expand(1, cameras, n, n).contiguous() for n in (3, 4))
-    inputs: list[Tensor] = [torch.randn(1, cameras, 3, height, width), eye3, eye4, eye3]
+    # three tensors of their own: inputs that are one tensor would become one input
+    eyes = [torch.eye(n).expand(1, cameras, n, n).clone() for n in (3, 4, 3)]
+    inputs: list[Tensor] = [torch.randn(1, cameras, 3, height, width), *eyes]
     names = [*_VIEWS]
     if isinstance(network.module, Lmop):
         inputs += [torch.zeros(1, *config.shape, config.classes), torch.ones(1, *config.shape, dtype=torch.bool)]
