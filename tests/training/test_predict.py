@@ -300,6 +300,5 @@ def test_predicted_occupancy_becomes_a_map_that_answers(baseline, tmp_path):
     scene = build_map(join_occupancy(frames, str(tmp_path / "pred" / "{token}.npz")), encoder)
     assert len(scene.voxels) > 100
     assert find(scene, "road", encoder).verdict in ("found", "absent")
-    height = scene.voxels.centers()[:, 2] if hasattr(scene.voxels, "centers") else None
-    assert height is None or height.min() > -0.6
+    assert scene.voxels.centers[:, 2].min() > -0.6
     assert city.read(frames[0].T_world_ego, network.spec).known.any()
