@@ -1,4 +1,4 @@
-# demo: map, question, picture and viewer of the synthetic street     test: all that must pass
+# demo: map, question, picture and viewer of the synthetic city       test: all that must pass
 # check: the part of test that reads code    bench: measurements      clean: remove what was made
 PYTHON ?= python3
 VENV := .venv

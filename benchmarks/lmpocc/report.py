@@ -188,8 +188,11 @@ def _plots(found: dict[str, Any], out: Path, name: str) -> None:
     plt.close(figure)
 
 
-def _errors(axis: Any, x: list[float], points: list[dict[str, float]], color: str, label: str) -> None:
+def _errors(
+    axis: Any, x: list[float], points: list[dict[str, float]], color: str, label: str, *, line: bool = True
+) -> None:
     mean = [p["mean"] for p in points]
     low = [max(p["mean"] - p["low"], 0) for p in points]
     high = [max(p["high"] - p["mean"], 0) for p in points]
-    axis.errorbar(x, mean, [low, high], marker="o", color=color, label=label, capsize=3, linewidth=1.2)
+    axis.errorbar(x, mean, [low, high], marker="o", color=color, label=label, capsize=3, linewidth=1.2,
+                  linestyle="-" if line else "none", elinewidth=1.2)  # fmt: skip

@@ -29,6 +29,8 @@ class Phrases:
     """int8 [texts, states]."""
     names: dict[str, list[int]]
     """Rows of the texts of each plain thing: `car` -> rows of car, cars, automobile."""
+    colored: dict[str, np.ndarray]
+    """Rows [words, colours] of the texts of coloured things: `car` -> red car, blue car; -1 is kept out."""
 
 
 def kinds_of(lexicon: dict, thing: str) -> set[str]:
@@ -63,6 +65,7 @@ def build(lexicon: dict, states: list[State]) -> Phrases:
     texts: list[str] = []
     truth: list[np.ndarray] = []
     names: dict[str, list[int]] = {}
+    colored: dict[str, np.ndarray] = {}
 
     def add(text: str, row: np.ndarray) -> int:
         texts.append(text)
@@ -74,10 +77,14 @@ def build(lexicon: dict, states: list[State]) -> Phrases:
     for thing, row in things.items():
         entry = lexicon["things"][thing]
         names[thing] = [add(word, row) for word in entry["words"]]
-        for color in lexicon["colors"] if entry.get("colored") else ():
-            if (color, thing) not in kept_out:
-                for word in entry["words"][:3]:
-                    add(f"{color} {word}", both(row, color_truth(color, states)))
+        if entry.get("colored"):
+            colored[thing] = np.full((3, len(lexicon["colors"])), -1)
+            for at, color in enumerate(lexicon["colors"]):
+                if (color, thing) not in kept_out:
+                    for k, word in enumerate(entry["words"][:3]):
+                        colored[thing][k, at] = add(f"{color} {word}", both(row, color_truth(color, states)))
+    for color in lexicon["colors"]:  # of what has no colour of its own nothing is known
+        add(color, np.where([s.color == "" for s in states], UNSURE, color_truth(color, states)).astype(np.int8))
     for entry in lexicon["parts"].values():
         row = np.array([int(s.part in entry["parts"]) for s in states], dtype=np.int8)
         for word in entry["words"]:
@@ -92,7 +99,7 @@ def build(lexicon: dict, states: list[State]) -> Phrases:
             add(word, np.array(found, dtype=np.int8))
     for word in lexicon["absent"]:
         add(word, np.zeros(len(states), dtype=np.int8))
-    return Phrases(texts, np.stack(truth), names)
+    return Phrases(texts, np.stack(truth), names, colored)
 
 
 def _kinds_if_thing(lexicon: dict, name: str) -> set[str]:

@@ -3,7 +3,9 @@
 Pairs of colour and thing that the lexicon keeps out are painted over before a picture is taken, so that no training
 picture holds them. Seeds of the city:
 
-    training 1000-1013, validation 1100-1101; evaluation 2000-2003, never used here nor for any choice.
+    training 1000-1063, validation 1100-1101; evaluation 2000-2003, never used here nor for any choice.
+
+In some of the training cities many cars give way to what is rare in a street: buses, trailers, cones.
 
     python models/demo/scenes.py            # all training and validation drives; goes on where it stopped
 """
@@ -18,14 +20,19 @@ from phrases import SKY, State, kinds_of
 
 from openvocab_occ.datasets.city import PART_NAMES, City, Traversal
 from openvocab_occ.datasets.city import SKY as SKY_PART
+from openvocab_occ.datasets.city.furniture import barrier, cone
 from openvocab_occ.datasets.city.mesh import Mesh
 from openvocab_occ.datasets.city.parking import vehicle
-from openvocab_occ.datasets.city.surfaces import Material
+from openvocab_occ.datasets.city.riders import bicycle, pedestrian
+from openvocab_occ.datasets.city.surfaces import PAINTS, Material
 from openvocab_occ.datasets.city.things import Thing
+from openvocab_occ.datasets.city.trucks import excavator, wheel_loader
+from openvocab_occ.datasets.city.vehicles import CAR_KINDS
 
 HERE = Path(__file__).parent
 CACHE = HERE / "cache" / "drives"
-TRAINING = tuple(range(1000, 1014))
+TRAINING = tuple(range(1000, 1064))
+ENRICHED = range(1035, 1064)
 VALIDATION = (1100, 1101)
 SIZE = (704, 256)
 STRIDE = 4
@@ -42,14 +49,22 @@ _CONDITIONS = (
     "heavy traffic",
     "night",
 )
+_RARE = {
+    "bus": 3, "van": 2, "trailer": 3, "motorcycle": 3, "bicycle": 3, "excavator": 1, "wheel loader": 1,
+    "traffic cone": 1, "barrier": 1, "pedestrian": 2, "tanker truck": 1, "flatbed truck": 1,
+}  # fmt: skip
 _INSTEAD = ("white", "black", "silver", "brown", "beige", "grey")  # none of them is kept out
 
 
-def repaint(drive: Traversal, lexicon: dict) -> None:
-    """Change the colour of every thing of a drive that must never be rendered."""
+def repaint(drive: Traversal, lexicon: dict, seed: int) -> None:
+    """Change the colour of every thing of a drive that must never be rendered, and put in what is rare."""
     banned = {(kind, color) for color, thing in lexicon["never_rendered"] for kind in kinds_of(lexicon, thing)}
 
+    random, rare = np.random.default_rng(seed), seed in ENRICHED
+
     def other(thing: Thing) -> Thing:
+        if rare and thing.kind in CAR_KINDS and random.random() < 0.5:
+            return _rare(thing, random, banned)
         if (thing.kind, thing.color) not in banned:
             return thing
         color = _INSTEAD[thing.id % len(_INSTEAD)]
@@ -58,6 +73,26 @@ def repaint(drive: Traversal, lexicon: dict) -> None:
     drive.still = [other(thing) for thing in drive.still]  # replaces what the drive would compute
     ego, movers = drive._motions
     drive._motions = (ego, [replace(mover, thing=other(mover.thing)) for mover in movers])
+
+
+def _rare(thing: Thing, random: np.random.Generator, banned: set[tuple[str, str]]) -> Thing:
+    """Put something that is rare in the place of a thing."""
+    kind = str(random.choice(list(_RARE), p=np.array(list(_RARE.values())) / sum(_RARE.values())))
+    color = str(random.choice([color for color in PAINTS if (kind, color) not in banned]))
+    match kind:
+        case "bicycle":
+            mesh = bicycle(color)
+        case "excavator" | "wheel loader":
+            color = "yellow"
+            mesh = excavator(color) if kind == "excavator" else wheel_loader(color)
+        case "traffic cone" | "barrier":
+            color = ""
+            mesh = cone() if kind == "traffic cone" else barrier()
+        case "pedestrian":
+            mesh = pedestrian(color, int(random.integers(4)))
+        case _:
+            mesh = vehicle(kind, color)[0]
+    return replace(thing, kind=kind, color=color, mesh=mesh)
 
 
 def materials(mesh: Mesh) -> dict[int, str]:
@@ -104,7 +139,7 @@ def write_drive(seed: int, lexicon: dict, folder: Path = CACHE) -> Path:
     if path.exists():
         return path
     drive = City(seed).traversal(route=seed % 3, condition=_CONDITIONS[seed % len(_CONDITIONS)])
-    repaint(drive, lexicon)
+    repaint(drive, lexicon, seed)
     table = StateTable(drive)
     images, states = [], []
     for index in KEYFRAMES:

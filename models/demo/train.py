@@ -18,7 +18,7 @@ import numpy as np
 import torch
 import yaml
 from network import Segmenter, WordHead
-from phrases import UNSURE, State, build
+from phrases import UNSURE, State, build, kinds_of
 from scenes import CACHE, TRAINING, VALIDATION
 from torch.nn import functional
 from words import Words
@@ -32,7 +32,9 @@ PIXELS, PHRASES = 2000, 256  # a step
 STRANGERS = 64  # random words a step
 PEAK_RATE, WARM_UP = 3e-3, 300
 RESCAN = 200  # steps between looks for new drives
+SOUGHT = 0.6  # of the crops are around a pixel of a class that is drawn first, so that rare ones are seen
 _KEEP = 0.998  # of the running mean of weights
+_CLASS_OF = {kind: number for number, kinds in enumerate(CLASSES.values()) for kind in kinds}
 
 
 class Drives:
@@ -40,6 +42,7 @@ class Drives:
 
     def __init__(self, seeds: tuple[int, ...]) -> None:
         self._seeds, self.states = seeds, []
+        self._where: dict[int, list[int]] = {}
         self.images: list[np.ndarray] = []
         self.numbers: list[np.ndarray] = []
         self._number: dict[State, int] = {}
@@ -56,17 +59,28 @@ class Drives:
                         self._number[state] = len(self.states)
                         self.states.append(state)
                 table = np.array([self._number[state] for state in own])
+                for picture in table[drive["states"]]:
+                    for number in np.unique(np.array([_CLASS_OF.get(s.kind, -1) for s in self.states])[picture]):
+                        self._where.setdefault(int(number), []).append(len(self.numbers))
+                    self.numbers.append(picture)
                 self.images += list(drive["images"])
-                self.numbers += list(table[drive["states"]])
         return bool(new)
 
     def crop(self, random: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return a random part of a picture, float [3, h, w] in 0..1, and its states, [h / 4, w / 4]."""
-        at = int(random.integers(len(self.images)))
+        """Return a part of a picture, float [3, h, w] in 0..1, and its states, [h / 4, w / 4]."""
+        sought = int(random.choice(list(self._where))) if random.random() < SOUGHT else None
+        at = int(random.choice(self._where[sought]) if sought is not None else random.integers(len(self.images)))
         image, states = self.images[at], self.numbers[at]
         zoom = random.choice([0.8, 1.0, 1.0, 1.6])
-        height, width = (int(n / zoom / 4) for n in CROP)
-        top, left = (int(random.integers(a - b + 1)) for a, b in zip(states.shape, (height, width), strict=True))
+        size = [int(n / zoom / 4) for n in CROP]
+        first, last = [0, 0], [a - b for a, b in zip(states.shape, size, strict=True)]
+        if sought is not None:
+            kinds = np.array([_CLASS_OF.get(s.kind, -1) for s in self.states])
+            pixel = random.choice(np.argwhere(kinds[states] == sought))
+            first = [min(max(int(p) - b + 1, 0), e) for p, b, e in zip(pixel, size, last, strict=True)]
+            last = [min(int(p), e) for p, e in zip(pixel, last, strict=True)]
+        top, left = (int(random.integers(a, b + 1)) for a, b in zip(first, last, strict=True))
+        height, width = size
         part = torch.from_numpy(image[4 * top : 4 * (top + height), 4 * left : 4 * (left + width)].copy())
         x = part.permute(2, 0, 1).float()[None] / 255
         y = torch.from_numpy(states[top : top + height, left : left + width].copy())[None, None].float()
@@ -93,9 +107,15 @@ class Truth:
         of_kind = np.bincount(kinds, weights=count)[kinds]
         # rare kinds are seen more often, and within a kind its rare colours and parts a little
         self.weight = torch.from_numpy((of_kind + 200) ** -0.5 * ((count + 50) / (of_kind + 50)) ** -0.2).float()
-        number = {kind: i for i, kinds in enumerate(CLASSES.values()) for kind in kinds}
-        self.classes = torch.tensor([number.get(s.kind, -1) for s in drives.states], device=device)
+        self.classes = torch.tensor([_CLASS_OF.get(s.kind, -1) for s in drives.states], device=device)
         self.names = [torch.tensor(self.phrases.names[name], device=device) for name in CLASSES]
+        self.colored = {thing: torch.tensor(rows, device=device) for thing, rows in self.phrases.colored.items()}
+        colors = {color: i for i, color in enumerate(lexicon["colors"])}
+        self.colors = torch.tensor([colors.get(s.color, -1) for s in drives.states], device=device)
+        self.things = {
+            thing: torch.tensor([s.kind in kinds_of(lexicon, thing) for s in drives.states], device=device)
+            for thing in self.colored
+        }
 
 
 def losses(
@@ -124,7 +144,20 @@ def losses(
     one = torch.stack([rows[int(torch.randint(len(rows), ()))] for rows in truth.names])
     kind = truth.classes[states]
     among = functional.cross_entropy(scale * cells @ texts[one].T, kind, ignore_index=-1, label_smoothing=0.02)
-    return 8 * agree + among
+    return 8 * agree + among + _color_loss(scale * cells, states, texts, truth)
+
+
+def _color_loss(cells: torch.Tensor, states: torch.Tensor, texts: torch.Tensor, truth: Truth) -> torch.Tensor:
+    """Return the cross entropy of the colours of coloured things, each asked as one of its words: red van, blue van."""
+    total, count = cells.new_zeros(()), 0
+    for thing, rows in truth.colored.items():
+        of = truth.things[thing][states] & (truth.colors[states] >= 0)
+        if of.any():
+            asked = rows[int(torch.randint(len(rows), ()))]
+            logits = (cells[of] @ texts[asked].T).masked_fill(asked < 0, -1e4)
+            total = total + functional.cross_entropy(logits, truth.colors[states[of]], reduction="sum")
+            count += int(of.sum())
+    return total / max(count, 1)
 
 
 @torch.inference_mode()
@@ -132,8 +165,7 @@ def validate(net: Segmenter, head: WordHead, drives: Drives, words: Words, devic
     """Return the mean IoU of class names as prompts on cells of every third validation picture."""
     names = list(CLASSES)
     texts = head(words.mean(names).to(device))
-    number = {kind: i for i, kinds in enumerate(CLASSES.values()) for kind in kinds}
-    table = np.array([number.get(s.kind, -1) for s in drives.states])
+    table = np.array([_CLASS_OF.get(s.kind, -1) for s in drives.states])
     confusion = np.zeros((len(names), len(names)))
     for image, states in list(zip(drives.images, drives.numbers, strict=True))[::3]:
         x = torch.from_numpy(image).permute(2, 0, 1)[None].float().to(device) / 255

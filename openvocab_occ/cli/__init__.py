@@ -16,7 +16,7 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
-    "demo": Command("demo:demo", "build, ask, export and show the map of a synthetic street"),
+    "demo": Command("demo:demo", "map a drive through the synthetic city, ask it, show it"),
     "city": Command("city:city", "write a made-up town, driven many times, as a nuScenes tree"),
     "doctor": Command("doctor:doctor", "look at a drive before it is mapped, and say what is wrong"),
     "map": Command("map:build", "turn a drive and an ONNX model into a map"),
@@ -46,6 +46,7 @@ COMMANDS = {
     "memory rebuild": Command("memory:rebuild", "make a map anew, without an agent or by another policy"),
     "memory export": Command("memory:export", "draw a map, or write its voxels to a file"),
     "crowdsource": Command("crowdsource:crowdsource", "let agents drive concurrently into one map"),
+    "eval memory": Command("eval_memory:memory", "show what the global map is good for, on synthetic streets"),
     "bench memory": Command("bench_memory:memory", "measure the global map"),
     "bench fusion": Command("bench_fusion:fusion", "time the fusion of prior and present beside Neural Map Prior's"),
     "eval keyframe": Command("evaluate:keyframe", "judge depth and answers by the LiDAR of a real keyframe"),

@@ -61,15 +61,16 @@ def depth(
     )
 
 
-def surface(*, json: bool = False) -> None:
-    """Judge depth from voxels, and from the smooth surface of labels and of logits, by three synthetic meshes.
+def surface(*, city: int | None = None, json: bool = False) -> None:
+    """Judge depth from voxels, and from the smooth surface of labels and of logits, by synthetic meshes.
 
     Args:
+        city: Seed of a synthetic city to judge by as well, besides three small scenes.
         json: Print one JSON object.
     """
-    from openvocab_occ.evaluation.mesh_scenes import surface_errors
+    from openvocab_occ.evaluation.mesh_scenes import city_errors, surface_errors
 
-    errors = surface_errors()
+    errors = surface_errors() + (() if city is None else city_errors(city))
     if json:
         print_json({"errors": [asdict(error) for error in errors]})
         return

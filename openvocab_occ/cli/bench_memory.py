@@ -31,8 +31,10 @@ def memory(
     lines = (
         f"window, cached   {report['window_cached_ms']:8.1f} ms  {report['window_cached_ratio']:.2f} x numpy's",
         f"window, cold     {report['window_cold_ms']:8.1f} ms  {report['window_cold_ratio']:.2f} x decoding its chunks",
+        f"  and numpy's gather        {report['window_cold_ratio_to_files_and_gather']:.2f} x",
         f"durable update   {report['update_ms']:8.1f} ms  {report['update_ratio']:.2f} x the same files, fsynced",
         f"  and journal    {report['journaled_update_ms']:8.1f} ms  {report['journaled_update_ratio']:.2f} x",
+        f"  eight at a time {report['update_ms_in_batches_of_8']:7.1f} ms each",
         f"storage          {report['gb_per_km2_of_tiles']:8.3f} GB/km² of tiles, "
         f"{report['gb_per_km2_of_known_ground']:.3f} of known ground; dense {report['dense_float32_gb_per_km2']:.2f}",
         f"labels changed   {report['argmax_changed']:8.4%}, probabilities by {report['worst_probability_error']:.4f}",

@@ -7,13 +7,14 @@ from openvocab_occ.cli.map import summary
 from openvocab_occ.cli.output import console, print_json, progress
 
 QUESTION = "parked trucks"
+_SEED, _FRAMES = 7, 12
 
 
 def demo(*, out: Path = Path("out/demo"), no_view: bool = False, port: int = 8080, json: bool = False) -> None:
-    """Build the map of a synthetic street with the shipped model, ask it for "parked trucks", export a view, show it.
+    """Map a drive through the synthetic city with the shipped model, ask for "parked trucks", export a view, show it.
 
     Args:
-        out: Folder for the map (street.ovmap) and the view bundle (view).
+        out: Folder for the map (city.ovmap) and the view bundle (view).
         no_view: Do not start the web viewer.
         port: Port of the web viewer.
         json: Print one JSON object.
@@ -22,14 +23,14 @@ def demo(*, out: Path = Path("out/demo"), no_view: bool = False, port: int = 808
     from openvocab_occ.export.views import export_views
     from openvocab_occ.pipeline.build import build_map
     from openvocab_occ.query.find import find
-    from openvocab_occ.segmentation.demo_models import street_model
+    from openvocab_occ.segmentation.demo_models import demo_model
     from openvocab_occ.segmentation.onnx import load_encoder
 
     started = time.perf_counter()
-    encoder = load_encoder(street_model())
-    with progress("mapping a synthetic street") as advance:
-        scene = build_map(load_sequence("street"), encoder, progress=advance)
-    path = out / "street.ovmap"
+    encoder = load_encoder(demo_model())
+    with progress("driving through a synthetic city") as advance:
+        scene = build_map(load_sequence("city", seed=_SEED, frames=_FRAMES), encoder, progress=advance)
+    path = out / "city.ovmap"
     scene.save(path)
     answer = find(scene, QUESTION, encoder)
     bundle = out / "view"
@@ -45,7 +46,7 @@ def demo(*, out: Path = Path("out/demo"), no_view: bool = False, port: int = 808
         print_json(report)
     else:
         say = console().print
-        say(f"[bold]{path}[/bold]  {report['voxels']:,} voxels, {report['objects']} objects of a synthetic street, "
+        say(f"[bold]{path}[/bold]  {report['voxels']:,} voxels, {report['objects']} objects of a synthetic city, "
             f"{report['seconds']:.1f} s")  # fmt: skip
         say(answer.explain(), markup=False)
         say(f"[bold]{bundle}[/bold]  a rendered view for a person or a vision-language model")

@@ -16,19 +16,9 @@ from openvocab_occ.datasets.frame import Frame, View
 from openvocab_occ.datasets.registry import load_sequence
 from openvocab_occ.depth.render import DepthImage, render_depth
 from openvocab_occ.evaluation import mapping_peers
-from openvocab_occ.geometry import Camera, GridSpec, look_at
-from openvocab_occ.mapping import (
-    Lifted,
-    PixelWeights,
-    Segments,
-    Sight,
-    VoxelMap,
-    cover_grid,
-    lift,
-    rows_from_depth,
-    rows_from_grid,
-)  # fmt: skip
-from openvocab_occ.objects import group_objects
+from openvocab_occ.evaluation.bench_rgbd import bench_rgbd
+from openvocab_occ.geometry import Camera, look_at
+from openvocab_occ.mapping import Lifted, PixelWeights, Sight, VoxelMap, cover_grid, lift, rows_from_grid
 from openvocab_occ.occupancy import OccupancyGrid, read_occ3d
 from openvocab_occ.pipeline.build import MapBuilder, build_map
 from openvocab_occ.segmentation.encoder import FeatureMap
@@ -186,7 +176,7 @@ def bench_fuse(*, frames: int = 500, rows: int = 7500) -> dict[str, Any]:
         began = time.perf_counter()
         voxels.integrate(keys.astype(np.int32), lifted, time=float(frame))
         times.append(time.perf_counter() - began)
-        sizes.append(voxels.num_stored)
+        sizes.append(len(voxels))
         memory.append(resident_mb() - start)
     early, late = statistics.median(times[3:13]), statistics.median(times[-10:])
     half = frames // 2
@@ -213,7 +203,7 @@ class _Precomputed:
 
 def bench_map(labels: Path | None = None, *, rounds: int = 5, frames: int = 40) -> dict[str, Any]:
     """Time whole keyframes without the network, RGB-D frames with masks beside object clouds, and the file."""
-    return {"keyframe": _keyframe(labels, rounds), "rgbd": _rgbd(frames), "file": _file()}
+    return {"keyframe": _keyframe(labels, rounds), "rgbd": bench_rgbd(frames), "file": _file()}
 
 
 def _keyframe(labels: Path | None, rounds: int) -> dict[str, Any]:
@@ -272,89 +262,6 @@ def _stages(
     marks.append(time.process_time())
     names = ("depth", "rows and cover", "lift", "fuse", "look through")
     return dict(zip(names, np.diff(marks).tolist(), strict=True))
-
-
-def _room() -> OccupancyGrid:
-    """Return a made-up room of 8 x 6 x 2.8 m in voxels of 5 cm, furnished with boxes, each its own label."""
-    labels = np.zeros((160, 120, 56), dtype=np.uint8)
-    for edge in (np.s_[:2], np.s_[-2:]):
-        labels[edge], labels[:, edge], labels[:, :, edge] = 1, 2, 3
-    rng = np.random.default_rng(3)
-    for label in range(4, 44):
-        x, y = int(rng.integers(4, 140)), int(rng.integers(4, 100))
-        if 50 < x < 110 and 40 < y < 80:
-            continue  # where the camera walks
-        w, d, h = rng.integers(8, 24, 3)
-        labels[x : x + w, y : y + d, 2 : 2 + h] = label
-    names = ("free", *(f"thing {i}" for i in range(1, 64)))
-    return OccupancyGrid(labels, GridSpec((-4.0, -3.0, 0.0), 0.05, labels.shape), free_label=0, class_names=names)
-
-
-def _rgbd(frames: int) -> dict[str, Any]:
-    """Walk a camera of 640 x 480 through a room; about 25 masks a frame, each with a feature; processor time."""
-    room, rng = _room(), np.random.default_rng(0)
-    K = np.array([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]])
-    own = rng.normal(size=(4096, DIM)).astype(np.float32)
-    voxels, peer = VoxelMap(0.05, DIM), mapping_peers.ObjectClouds()
-    stages: dict[str, list[float]] = {"rows": [], "lift": [], "fuse": [], "object clouds": []}
-    masks = []
-    for number in range(frames):
-        turn = 2 * np.pi * number / frames
-        eye = np.array([1.2 * np.cos(turn), 0.8 * np.sin(turn), 1.5])
-        ahead = np.array([np.cos(turn * 1.7), np.sin(turn * 1.7), -0.25])
-        camera = Camera(K, 640, 480, look_at(eye, eye + ahead))
-        seen = render_depth(room, camera, max_depth=10.0)
-        depth = np.where(seen.voxel >= 0, seen.depth + np.float32(0.005), 0).astype(np.float32)
-        ids, vectors = _masks(room, seen, own, rng)
-        masks.append(len(vectors))
-        marks = [time.process_time()]
-        rows, keys = rows_from_depth(depth, camera, 0.05)
-        marks.append(time.process_time())
-        lifted = lift(rows, len(keys), Segments(ids, vectors), sight=Sight(camera, depth))
-        marks.append(time.process_time())
-        voxels.integrate(keys, lifted, time=float(number))
-        marks.append(time.process_time())
-        peer.integrate(depth, ids, vectors, camera)
-        marks.append(time.process_time())
-        for stage, seconds in zip(stages, np.diff(marks).tolist(), strict=True):
-            stages[stage].append(seconds)
-    ours = np.sum([stages[stage] for stage in ("rows", "lift", "fuse")], axis=0)[1:]
-    theirs = np.array(stages["object clouds"])[1:]
-    began = time.perf_counter()
-    objects = group_objects(voxels)
-    return {
-        "scene": "synthetic room", "frames": frames, "masks": statistics.mean(masks), "features": DIM,
-        "cpu_seconds": float(np.median(ours)), "peer_cpu_seconds": float(np.median(theirs)),
-        "cpu_ratio": float(np.mean(theirs) / np.mean(ours)),
-        "cpu_stages": {stage: statistics.median(values[1:]) for stage, values in stages.items()},
-        "growth": _growth(ours), "peer_growth": _growth(theirs),
-        "voxels": len(voxels), "peer_objects": len(peer.objects), "objects": len(objects),
-        "objects_seconds_once": time.perf_counter() - began,
-    }  # fmt: skip
-
-
-def _masks(
-    room: OccupancyGrid, seen: DepthImage, own: np.ndarray, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Cut the image into things, walls into pieces of 1.6 m; a thing's feature is its own and some noise."""
-    hit = seen.voxel >= 0
-    index = room.spec.unflat(seen.voxel[hit])
-    name = room.labels.reshape(-1)[seen.voxel[hit]].astype(np.int64)
-    piece = np.where(name < 4, (index // 32) @ np.array([25, 5, 1]) * 4 + name + 64, name)
-    found, inverse, count = np.unique(piece, return_inverse=True, return_counts=True)
-    largest = np.argsort(-count)[:25]
-    number = np.full(len(found), -1, dtype=np.int32)
-    number[largest] = np.arange(len(largest))
-    ids = np.full(seen.voxel.shape, -1, dtype=np.int32)
-    ids[hit] = number[inverse]
-    vectors = own[found[largest] % len(own)] + 0.3 * rng.normal(size=(len(largest), DIM)).astype(np.float32)
-    return ids, (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
-
-
-def _growth(times: np.ndarray) -> float:
-    """Return by what share the time of a frame grows from the first to the last, by a line through all."""
-    slope, start = np.polyfit(np.linspace(0, 1, len(times)), times, 1)
-    return float(slope / start)
 
 
 def _file() -> dict[str, Any]:

@@ -1,14 +1,15 @@
 """How often a map's answers are right, by category of question."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from openvocab_occ.evaluation.grounding_metrics import average_precision, box_iou, calibration_error
 from openvocab_occ.evaluation.grounding_queries import ABSENT, CATEGORIES, Question, questions_about
 from openvocab_occ.evaluation.grounding_truth import Truth, scene_of_truth, truth_of_city
-from openvocab_occ.objects import Box, SceneMap
+from openvocab_occ.objects import SceneMap, SceneObject
 from openvocab_occ.query.answer import Answer
 from openvocab_occ.query.find import find
 from openvocab_occ.segmentation.encoder import PixelEncoder
@@ -33,6 +34,17 @@ class Outcome:
     correct: tuple[bool, ...] = ()
     """Of the hits that carry a probability."""
 
+    @property
+    def right(self) -> bool:
+        """Tell whether the verdict is right, and where something is wanted the best hit too."""
+        return self.verdict == self.question.verdict and (not self.question.wanted or self.iou >= _SAME)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data for JSON."""
+        q = self.question
+        return {"category": q.category, "text": q.text, "wanted": len(q.wanted), "wanted_verdict": q.verdict,
+                "verdict": self.verdict, "named": self.count, "iou": self.iou, "precision": self.precision}  # fmt: skip
+
 
 @dataclass(frozen=True, kw_only=True)
 class CategoryScores:
@@ -50,12 +62,22 @@ class CategoryScores:
     """Share of questions that were wrongly called found."""
 
 
+Overlap = Callable[[SceneObject, int], float]
+"""IoU of an object of the map and a true thing, by its id."""
+
+
 def judge(
-    scene: SceneMap, truth: Truth, questions: Sequence[Question], encoder: PixelEncoder | None = None
+    scene: SceneMap,
+    truth: Truth,
+    questions: Sequence[Question],
+    encoder: PixelEncoder | None = None,
+    *,
+    overlap: Overlap | None = None,
 ) -> list[Outcome]:
-    """Ask a map questions and compare its answers with the truth."""
+    """Ask a map questions and compare its answers with the truth, by default by the IoU of boxes."""
     boxes = {thing.id: thing.box for thing in truth.things}
-    return [_outcome(find(scene, q.text, encoder, viewpoint=truth.viewer), q, boxes) for q in questions]
+    of = overlap or (lambda item, id: box_iou(item.box, boxes[id]))
+    return [_outcome(find(scene, q.text, encoder, viewpoint=truth.viewer), q, of) for q in questions]
 
 
 def summarize(outcomes: Sequence[Outcome]) -> dict[str, CategoryScores]:
@@ -80,26 +102,26 @@ def judge_truth(seeds: Sequence[int]) -> list[Outcome]:
     return outcomes
 
 
-def _outcome(answer: Answer, question: Question, boxes: dict[int, Box]) -> Outcome:
+def _outcome(answer: Answer, question: Question, of: Overlap) -> Outcome:
     hits = [hit for hit in answer.hits if not hit.undecided]
     taken: set[int] = set()
     correct: list[bool] = []
     counted: list[int] = []
     confidence: list[float] = []
     for rank, hit in enumerate(hits):
-        overlaps = {id: box_iou(hit.object.box, boxes[id]) for id in question.wanted - taken}
+        overlaps = {id: of(hit.object, id) for id in question.wanted - taken}
         best = max(overlaps, key=lambda id: overlaps[id], default=None)
         right = best is not None and overlaps[best] >= _SAME
         if right and best is not None:
             taken.add(best)
-        elif any(box_iou(hit.object.box, boxes[id]) >= _SAME for id in question.either):
+        elif any(of(hit.object, id) >= _SAME for id in question.either):
             continue
         counted.append(rank)
         correct.append(right)
         if hit.probability is not None:
             confidence.append(hit.probability)
     top = [hits[rank] for rank in counted[:1]]
-    iou = max((box_iou(hit.object.box, boxes[id]) for hit in top for id in question.wanted), default=0.0)
+    iou = max((of(hit.object, id) for hit in top for id in question.wanted), default=0.0)
     if question.wanted:
         precision = average_precision(np.array(correct, dtype=bool), len(question.wanted))
     else:

@@ -7,6 +7,7 @@ boxes; things too near a border to tell are marked `either`, and count for neith
 
 from collections import Counter
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -46,6 +47,15 @@ def questions_about(truth: Truth, seed: int, *, per_category: int = _PER_CATEGOR
     return drawn
 
 
+@lru_cache(maxsize=256)
+def plural(name: str) -> str:
+    """Return a name of a kind in the plural."""
+    from lemminflect import getInflection
+
+    *first, last = name.split()
+    return " ".join([*first, next(iter(getInflection(last, "NNS", inflect_oov=True)), f"{last}s")])
+
+
 def _ids(truth: Truth, kind: str, **more: str) -> frozenset[int]:
     chosen = (t for t in truth.things if t.kind == kind and all(getattr(t, k) == v for k, v in more.items()))
     return frozenset(t.id for t in chosen)
@@ -56,7 +66,7 @@ def _kinds(truth: Truth) -> list[str]:
 
 
 def _classes(truth: Truth) -> list[Question]:
-    return [Question(text=f"{kind}s", category="class", wanted=_ids(truth, kind)) for kind in _kinds(truth)]
+    return [Question(text=plural(kind), category="class", wanted=_ids(truth, kind)) for kind in _kinds(truth)]
 
 
 def _synonyms(truth: Truth) -> list[Question]:
@@ -79,7 +89,12 @@ def _colours(truth: Truth) -> list[Question]:
         for _, kind in pairs
     }
     return [
-        Question(text=f"{color} {kind}s", category="colour", wanted=_ids(truth, kind, color=color), either=either[kind])
+        Question(
+            text=f"{color} {plural(kind)}",
+            category="colour",
+            wanted=_ids(truth, kind, color=color),
+            either=either[kind],
+        )
         for color, kind in pairs
     ]
 
@@ -87,7 +102,7 @@ def _colours(truth: Truth) -> list[Question]:
 def _states(truth: Truth) -> list[Question]:
     pairs = sorted({(t.state, t.kind) for t in truth.things if t.state in ("moving", "parked")})
     return [
-        Question(text=f"{state} {kind}s", category="state", wanted=_ids(truth, kind, state=state))
+        Question(text=f"{state} {plural(kind)}", category="state", wanted=_ids(truth, kind, state=state))
         for state, kind in pairs
     ]
 
@@ -110,7 +125,9 @@ def _relations(truth: Truth) -> list[Question]:
 
 
 def _counts(truth: Truth) -> list[Question]:
-    return [Question(text=f"how many {kind}s", category="count", wanted=_ids(truth, kind)) for kind in _kinds(truth)]
+    return [
+        Question(text=f"how many {plural(kind)}", category="count", wanted=_ids(truth, kind)) for kind in _kinds(truth)
+    ]
 
 
 def _absent(truth: Truth) -> list[Question]:

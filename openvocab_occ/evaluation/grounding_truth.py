@@ -60,7 +60,7 @@ def truth_of_city(seed: int, *, route: int = 0, index: int = 8) -> Truth:
         found.append((mover.thing, drive.mover_pose(mover, time), "moving" if speed > 0.5 else "stopped"))
     things = []
     for thing, pose, state in found:
-        box = _box(thing, pose)
+        box = box_of(thing, pose)
         if np.hypot(*(box.center[:2] - T[:2, 3])) < RANGE and box.size[2] > _HIDDEN:
             color = thing.color if thing.color in PAINTS else ""
             things.append(TrueThing(id=len(things) + 1, kind=thing.kind, color=color, state=state, box=box))
@@ -141,7 +141,8 @@ def _rgb(color: str) -> tuple[int, int, int]:
     return int(digits[:2], 16), int(digits[2:4], 16), int(digits[4:], 16)
 
 
-def _box(thing: Thing, T: np.ndarray) -> Box:
+def box_of(thing: Thing, T: np.ndarray) -> Box:
+    """Return the box of a thing at a pose; its yaw is in -90..90 degrees, along its longer side."""
     low, high = (np.array(corner, dtype=np.float64) for corner in thing.mesh.bounds)
     center = T[:3, :3] @ ((low + high) / 2) + T[:3, 3]
     length, width, height = high - low

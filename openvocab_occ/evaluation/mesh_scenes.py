@@ -1,14 +1,18 @@
-"""Three small scenes of meshes, their voxels, and how far depth from voxels is off that of the meshes. Synthetic."""
+"""Scenes of meshes, their voxels, and how far depth from voxels is off that of the meshes. All synthetic."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32
 
+from openvocab_occ.datasets.city import City
+from openvocab_occ.datasets.city.keyframes import frame, labels
+from openvocab_occ.datasets.city.oracle import perceive
+from openvocab_occ.datasets.frame import View
 from openvocab_occ.depth.render import render_depth
-from openvocab_occ.geometry import Camera, GridSpec, look_at
+from openvocab_occ.geometry import Camera, GridSpec, invert, look_at, transform
 from openvocab_occ.occupancy import GEOMETRY_CLASSES, OccupancyGrid
 
 SPEC = GridSpec((-8.0, -8.0, -1.2), 0.4, (40, 40, 16))
@@ -97,8 +101,47 @@ def surface_errors(*, width: int = 160, height: int = 120) -> tuple[SurfaceError
     return tuple(errors)
 
 
-def _error(scene: str, surface: str, depth: Float32[np.ndarray, "n h w"], truth: np.ndarray) -> SurfaceError:
-    seen, there = depth < _MAX_DEPTH, truth < _MAX_DEPTH
+def city_errors(seed: int = 0, *, keyframes: Sequence[int] = (5, 20, 35)) -> tuple[SurfaceError, ...]:
+    """Compare depth from Occ3D labels of the synthetic city, and from perceived logits, with its true depth.
+
+    Six cameras of 704 x 256 at keyframes of the first drive; `perceived` are the oracle perception's logits in clear
+    weather, wrong as its docstring states. Pixels whose surface lies beyond the grid count as empty.
+    """
+    drive = City(seed).traversal(route=0)
+    depths: dict[str, list[np.ndarray]] = {}
+    truth: list[np.ndarray] = []
+    for index in keyframes:
+        keyframe = frame(drive, index, depth=True)
+        true = labels(drive, index)
+        whole, seen = replace(true.grid, known=None), replace(perceive(true, seed=seed), known=None)
+        cameras = [view.camera for view in keyframe.views]
+        ways = {
+            "voxel": render_depth(whole, cameras),
+            "smooth labels": render_depth(whole, cameras, surface="smooth"),
+            "voxel, perceived": render_depth(seen, cameras),
+            "smooth logits, perceived": render_depth(seen, cameras, surface="smooth"),
+        }
+        for name, images in ways.items():
+            depths.setdefault(name, []).extend(image.depth for image in images)
+        truth += [_within(whole, view) for view in keyframe.views]
+    both = np.stack(truth)
+    return tuple(_error(f"city {seed}", name, np.stack(images), both, 100.0) for name, images in depths.items())
+
+
+def _within(grid: OccupancyGrid, view: View) -> Float32[np.ndarray, "h w"]:
+    """Return the true depth of a view, infinite beyond the grid."""
+    assert view.depth is not None  # asked for
+    there = view.depth > 0
+    points = view.camera.position + view.camera.rays() @ view.camera.T_world_cam[:3, :3].T * view.depth[..., None]
+    T = invert(grid.T_world_grid)
+    inside = grid.spec.contains(grid.spec.index(transform(T, points.reshape(-1, 3)))).reshape(there.shape)
+    return np.where(there & inside, view.depth, np.float32(np.inf)).astype(np.float32)
+
+
+def _error(
+    scene: str, surface: str, depth: Float32[np.ndarray, "n h w"], truth: np.ndarray, most: float = _MAX_DEPTH
+) -> SurfaceError:
+    seen, there = depth < most, truth < most
     off = (depth - truth)[seen & there]
     size = np.abs(off)
     misses = float((seen != there).mean())

@@ -78,7 +78,7 @@ def judge_objects(
 ) -> tuple[ObjectReport, SceneMap]:
     """Build a map of a drive and score its objects; return the scores and the map."""
     builder = MapBuilder(encoder, objects=config)
-    record = _Record()
+    record = Record()
     seconds: list[float] = []
     for done, frame in enumerate(frames, start=1):
         if isinstance(encoder, TruthEncoder):
@@ -94,7 +94,7 @@ def judge_objects(
     return record.report(scene, builder.objects.merged, seconds), scene
 
 
-class _Record:
+class Record:
     """What was true and what was found, frame by frame. Mutable."""
 
     def __init__(self) -> None:
@@ -132,8 +132,7 @@ class _Record:
 
     def report(self, scene: SceneMap, merged: Mapping[int, int], seconds: Sequence[float]) -> ObjectReport:
         """Sum up."""
-        states = {id: true_state(seen) for id, seen in self.things.items()}
-        true = self._sets(scene, {id for id, state in states.items() if state in ("moving", "stopped")})
+        states, true = self.states(), self.sets(scene)
         ids = sorted(true)
         sets = [true[id] for id in ids]
         ignored = [len(true[id]) < MIN_VOXELS or id not in self.things for id in ids]
@@ -162,8 +161,13 @@ class _Record:
             missed=missed,
         )
 
-    def _sets(self, scene: SceneMap, moved: set[int]) -> dict[int, np.ndarray]:
+    def states(self) -> dict[int, str]:
+        """Return the true state of each thing, from where it was when frames saw it."""
+        return {id: true_state(seen) for id, seen in self.things.items()}
+
+    def sets(self, scene: SceneMap) -> dict[int, np.ndarray]:
         """Return the packed keys of each true thing."""
+        moved = {id for id, state in self.states().items() if state in ("moving", "stopped")}
         keys = pack(scene.voxels.keys)
         here = set(keys.tolist())
         sets: defaultdict[int, list[int]] = defaultdict(list)

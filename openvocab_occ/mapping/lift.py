@@ -5,7 +5,7 @@ voxels = W @ cells with one sparse matrix W (voxels x cells), whose entries are 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import Any
 
@@ -18,7 +18,7 @@ from openvocab_occ.errors import ConfigError, ShapeError
 from openvocab_occ.geometry import Camera
 from openvocab_occ.mapping import _lift_kernels as kernels
 from openvocab_occ.mapping.key_table import KeyTable
-from openvocab_occ.segmentation.encoder import FeatureMap
+from openvocab_occ.segmentation.encoder import FeatureMap, MaskMap
 
 _NO_IMAGE = np.empty((0, 0, 3), dtype=np.uint8)
 _NO_DEPTH = np.empty((0, 0), dtype=np.float32)
@@ -63,6 +63,20 @@ class Segments:
     vectors: Float32[np.ndarray, "k c"]
     """Unit feature of each segment."""
 
+    @classmethod
+    def of(cls, masks: MaskMap, height: int, width: int) -> "Segments":
+        """Return the masks of an image of this size, each pixel in the mask of the nearest cell.
+
+        Pixels in no mask form one more segment, the last, of a zero vector: they are seen, and nothing is said of them.
+        """
+        x, y = (
+            np.clip(np.rint(masks.scale[axis] * np.arange(size) + masks.offset[axis]).astype(int), 0, cells - 1)
+            for axis, (size, cells) in enumerate(((width, masks.ids.shape[1]), (height, masks.ids.shape[0])))
+        )
+        ids = masks.ids[np.ix_(y, x)]
+        vectors = np.concatenate([masks.embeddings, np.zeros((1, masks.embeddings.shape[1]), np.float32)])
+        return cls(np.where(ids < 0, len(masks.embeddings), ids).astype(np.int32), vectors)
+
 
 @dataclass(frozen=True, eq=False)
 class Sight:
@@ -94,6 +108,8 @@ class Lifted:
     """Number of that view in its frame."""
     score: Float32[np.ndarray, " m"] | None = None
     """Weight in that view."""
+    mask: Int32[np.ndarray, " m"] | None = None
+    """Of `Segments`: view * 65536 + number of the segment in it that weighs most, -1 for none or one of no vector."""
 
 
 def lift(
@@ -104,6 +120,7 @@ def lift(
     image: UInt8[np.ndarray, "h w 3"] | None = None,
     sight: Sight | None = None,
     view: int = 0,
+    device: str | None = None,
 ) -> Lifted:
     """Add up the features, and colours, of the pixels that belong to each row.
 
@@ -111,6 +128,8 @@ def lift(
     cell; of `Segments`, pixels outside all of them add nothing at all. A row without pixels gets zeros. Without a
     `sight` every pixel weighs 1 and there are no normals. Memory beside the result: 4 bytes a pixel for inverse depth,
     and about 100 bytes for each pair of a row and a square between cell centres, whatever the length of a feature.
+
+    With a `device` such as `cuda` torch does the same there; sums differ by rounding.
 
     One 1600 x 900 view, 512 features at 1/16, 9,000 voxels: 0.08 s on one core, of it the product with W 0.02 s.
     """
@@ -122,6 +141,12 @@ def lift(
         check_shape(image, (*rows.shape, 3), "image of the lift")
     if sight is not None:
         check_shape(sight.depth, rows.shape, "depth of the lift")
+    if isinstance(features, Segments):
+        _check_segments(rows, features)
+    if device is not None:
+        from openvocab_occ.mapping.lift_torch import lift_on
+
+        return lift_on(device, rows, num_rows, features, image=image, sight=sight, view=view)
     if isinstance(features, Segments):
         return _lift_segments(rows, num_rows, features, image, sight, view)
     table = _entries(rows, num_rows, features, image, sight)
@@ -159,8 +184,8 @@ def _entries(
     y = np.clip(features.scale[1] * np.arange(h) + features.offset[1], 0, height - 1)
     left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     columns, bands = _runs(left), _runs(top)
-    reach = float(np.clip(round(0.5 / max(abs(features.scale[0]), 1e-9)), 1, 16))
-    inverse, K, rays, options = _shape_of(sight, reach, 1 / max(abs(features.scale[0]), 1e-9))
+    reach = pixel_reach(features.scale[0])
+    inverse, K, rays, options = _shape_of(sight, float(reach), 1 / max(abs(features.scale[0]), 1e-9))
     pixels = image if image is not None else _NO_IMAGE
     fx, fy = x - left, y - top
     parts: dict[int, tuple[np.ndarray, ...]] = {}
@@ -179,6 +204,11 @@ def _entries(
 
     in_slices(count, len(bands) - 1, grain=4)
     return _Entries(*(np.concatenate([parts[start][i] for start in sorted(parts)]) for i in range(4)))
+
+
+def pixel_reach(scale: float) -> int:
+    """Return how many pixels apart inverse depths are compared: half a cell, from 1 to 16."""
+    return int(np.clip(round(0.5 / max(abs(scale), 1e-9)), 1, 16))
 
 
 def _runs(values: np.ndarray) -> np.ndarray:
@@ -235,15 +265,18 @@ def _summed(
     )
 
 
-def _lift_segments(
-    rows: np.ndarray, num_rows: int, segments: Segments, image: np.ndarray | None, sight: Sight | None, view: int
-) -> Lifted:
-    """Lift segments as a feature map with a cell a segment, in which every pixel lies on the centre of its own."""
+def _check_segments(rows: np.ndarray, segments: Segments) -> None:
     check_shape(segments.ids, rows.shape, "ids of segments")
     if segments.ids.size and int(segments.ids.max()) >= len(segments.vectors):
         raise ShapeError(
             "ids of segments have no vector", expected=f"-1..{len(segments.vectors) - 1}", got=segments.ids.max()
         )
+
+
+def _lift_segments(
+    rows: np.ndarray, num_rows: int, segments: Segments, image: np.ndarray | None, sight: Sight | None, view: int
+) -> Lifted:
+    """Lift segments as a feature map with a cell a segment, in which every pixel lies on the centre of its own."""
     rows = np.where(segments.ids >= 0, rows, np.int32(-1))
     count = max(len(segments.vectors), 1)
     # one square a pair of row and segment: the row of the kernel is the pair
@@ -260,7 +293,13 @@ def _lift_segments(
     shares = table.fields[:, :4].sum(axis=1)
     W = coo_array((shares, (table.row, table.corner)), shape=(num_rows, len(segments.vectors))).tocsr()
     sums = np.asarray(W.astype(np.float32) @ segments.vectors, dtype=np.float32)
-    return _summed(table, num_rows, sums, image, sight, view)
+    mask = np.full(num_rows, -1, dtype=np.int32)
+    W.sum_duplicates()
+    row = np.repeat(np.arange(num_rows), np.diff(W.indptr))
+    told = (segments.vectors != 0).any(axis=1)
+    order = np.lexsort((-W.indices, W.data))  # the heaviest last; of equals the first segment
+    mask[row[order]] = np.where(told, view * 65536 + np.arange(len(told)), -1)[W.indices[order]]
+    return replace(_summed(table, num_rows, sums, image, sight, view), mask=mask)
 
 
 def join(parts: Sequence[Lifted]) -> Lifted:

@@ -30,7 +30,8 @@ RECORD = np.dtype(
         ("view_score", np.float32),
     ]
 )
-_BLOCK = 1 << 12
+BLOCK = 1 << 12
+"""Rows kept together."""
 _VIEW = ("view_frame", "view", "view_box", "view_score")
 _LABEL = ("label", "label_time", "label_pixels")
 
@@ -45,8 +46,8 @@ class FeatureSums:
 
     def reserve(self, count: int) -> None:
         """Make room for rows up to `count`; new ones are zero, and take no memory before they are written."""
-        while len(self._blocks) * _BLOCK < count:
-            self._blocks.append(np.zeros((_BLOCK, self.dim), dtype=np.float32))
+        while len(self._blocks) * BLOCK < count:
+            self._blocks.append(np.zeros((BLOCK, self.dim), dtype=np.float32))
         self._count = max(self._count, count)
 
     def add(
@@ -57,32 +58,32 @@ class FeatureSums:
         sums: Float32[np.ndarray, "m c"],
     ) -> None:
         """Add share[i] sums[source[i]] to each row[i]."""
-        order = np.argsort(rows // _BLOCK, kind="stable")
-        block = rows[order] // _BLOCK
+        order = np.argsort(rows // BLOCK, kind="stable")
+        block = rows[order] // BLOCK
         for start, stop in _runs(block):
             part = order[start:stop]
-            add_shares(rows[part] % _BLOCK, source[part], share[part], sums, self._blocks[int(block[start])])
+            add_shares(rows[part] % BLOCK, source[part], share[part], sums, self._blocks[int(block[start])])
 
     def add_all(self, rows: Int[np.ndarray, " p"], other: "FeatureSums") -> None:
         """Add row i of another to row rows[i]."""
-        for number, block in enumerate(other._blocks):
-            part = rows[number * _BLOCK : (number + 1) * _BLOCK]
+        for start in range(0, len(rows), BLOCK):
+            part = rows[start : start + BLOCK]
             source = np.arange(len(part), dtype=np.int32)
-            self.add(part, source, np.ones(len(part), dtype=np.float32), block)
+            self.add(part, source, np.ones(len(part), dtype=np.float32), other.rows(source.astype(np.int64) + start))
 
     def parts(self, order: Int[np.ndarray, " n"]) -> Iterator[Float32[np.ndarray, "m c"]]:
         """Yield the rows in this order, some at a time."""
-        for start in range(0, len(order), 4 * _BLOCK):
-            yield self.rows(order[start : start + 4 * _BLOCK])
+        for start in range(0, len(order), 4 * BLOCK):
+            yield self.rows(order[start : start + 4 * BLOCK])
 
     def rows(self, order: Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n c"]:
         """Return the rows in this order."""
         result = np.empty((len(order), self.dim), dtype=np.float32)
-        by_block = np.argsort(order // _BLOCK, kind="stable")
-        block = order[by_block] // _BLOCK
+        by_block = np.argsort(order // BLOCK, kind="stable")
+        block = order[by_block] // BLOCK
         for start, stop in _runs(block):
             part = by_block[start:stop]
-            result[part] = self._blocks[int(block[start])][order[part] % _BLOCK]
+            result[part] = self._blocks[int(block[start])][order[part] % BLOCK]
         return result
 
 

@@ -33,8 +33,14 @@ class VoxelMap:
     of the keys and may not be written to. A position in them holds until the map grows.
     """
 
-    def __init__(self, voxel_size: float, dim: int, *, contract: Contract = "dense", num_classes: int = 0) -> None:
-        """Begin with an empty map; `num_classes` of an occupancy grid are counted in `label_counts`, where above 0."""
+    def __init__(
+        self, voxel_size: float, dim: int, *, contract: Contract = "dense", num_classes: int = 0,
+        device: str | None = None,
+    ) -> None:  # fmt: skip
+        """Begin with an empty map; `num_classes` of an occupancy grid are counted in `label_counts`, where above 0.
+
+        With a `device` such as `cuda` torch keeps and adds up the features there; all else stays where it is.
+        """
         if not (np.isfinite(voxel_size) and voxel_size > 0):
             raise ConfigError("voxel size is not usable", expected="a length above 0 m", got=voxel_size)
         if dim < 1:
@@ -47,21 +53,16 @@ class VoxelMap:
         self.dim = int(dim)
         self.contract: Contract = contract
         self.num_classes = int(num_classes)
-        self.free = FreeSpace(self.voxel_size)
-        """Where cameras looked through; `integrate` does not touch it."""
+        self._free: FreeSpace | Callable[[], FreeSpace] = FreeSpace(self.voxel_size)
         self._table = KeyTable()  # rows in order of arrival
         self._records = Records(self.num_classes)
-        self._sums = FeatureSums(self.dim)
+        self._sums = FeatureSums(self.dim) if device is None else _sums_on(device, self.dim)
         self._cache: dict[str, np.ndarray] = {}
         self._load: Callable[[str], np.ndarray] | None = None  # where columns come from until the map grows
+        self._stored = 0  # how many voxels that holds
 
     def __len__(self) -> int:
-        return len(self._packed)
-
-    @property
-    def num_stored(self) -> int:
-        """Voxels, told without sorting them: cheap while the map grows."""
-        return len(self) if self._load else len(self._table)
+        return self._stored if self._load else len(self._table)
 
     def __repr__(self) -> str:
         return f"VoxelMap({len(self)} voxels of {self.voxel_size} m, {self.dim} {self.contract} channels)"
@@ -70,6 +71,17 @@ class VoxelMap:
     def keys(self) -> Int32[np.ndarray, "n 3"]:
         """Lattice indices, sorted by x, then y, then z."""
         return self._cached("keys", lambda: unpack(self._packed), always=True)
+
+    @property
+    def free(self) -> FreeSpace:
+        """Where cameras looked through; `integrate` does not touch it."""
+        if not isinstance(self._free, FreeSpace):
+            self._free = self._free()
+        return self._free
+
+    @free.setter
+    def free(self, space: FreeSpace) -> None:
+        self._free = space
 
     @property
     def centers(self) -> Float64[np.ndarray, "n 3"]:
@@ -160,6 +172,10 @@ class VoxelMap:
     def label_counts(self) -> UInt16[np.ndarray, "n k"]:
         """How many frames named each class of the occupancy; no columns where the map counts none."""
         return self._cached("label_counts", lambda: self._records.histogram[self._order])
+
+    def best_views(self, positions: Int[np.ndarray, " m"]) -> tuple[np.ndarray, ...]:
+        """Return frame (-1 for none), number of the view in it, pixel box and score of the best view of voxels."""
+        return tuple(self._column(name)[positions] for name in ("view_frame", "view", "view_box", "view_score"))
 
     def index(self, keys: Int32[np.ndarray, "m 3"]) -> Int64[np.ndarray, " m"]:
         """Return the position of each key, -1 where the map has no such voxel."""
@@ -331,21 +347,24 @@ class VoxelMap:
         cls,
         voxel_size: float,
         dim: int,
-        packed: Int64[np.ndarray, " n"],
+        count: int,
         load: Callable[[str], np.ndarray],
         *,
+        free: Callable[[], FreeSpace],
         contract: Contract,
         num_classes: int = 0,
     ) -> "VoxelMap":
-        """Return a map whose columns are read when they are asked for, by `load(name)`; `packed` keys are sorted."""
+        """Return a map of `count` voxels that are read when they are asked for, and so is what was seen through.
+
+        `load("packed")` gives the packed keys, sorted, and `load` of another name that column.
+        """
         voxels = cls(voxel_size, dim, contract=contract, num_classes=num_classes)
-        voxels._cache["packed"] = packed
-        voxels._load = load
+        voxels._stored, voxels._load, voxels._free = count, load, free
         return voxels
 
     @property
     def _packed(self) -> Int64[np.ndarray, " n"]:
-        return self._cached("packed", lambda: np.sort(self._table.keys), always=True)
+        return self._cached("packed", lambda: np.sort(self._table.keys))
 
     @property
     def _order(self) -> Int64[np.ndarray, " n"]:
@@ -372,3 +391,9 @@ class VoxelMap:
             array.flags.writeable = False
             self._cache[name] = array
         return self._cache[name]
+
+
+def _sums_on(device: str, dim: int) -> FeatureSums:
+    from openvocab_occ.mapping.records_torch import TorchFeatureSums
+
+    return TorchFeatureSums(dim, device)

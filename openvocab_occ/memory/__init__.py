@@ -8,3 +8,4 @@ prior = city.read(T_world_ego, spec, exclude_logs=["2026-11-22a"])
 from openvocab_occ.memory.tile_map import TileMap as TileMap
 from openvocab_occ.memory.tile_map import Written as Written
 from openvocab_occ.memory.window import Prior as Prior
+from openvocab_occ.memory.writer import Writer as Writer

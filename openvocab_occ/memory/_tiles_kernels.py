@@ -11,6 +11,7 @@ import numpy as np
 from openvocab_occ._jit import kernel
 
 _SNAP = 1e-6
+_SIDE = 64  # cells along a tile, as in schema.TILE: divisions by a constant are shifts
 
 
 @kernel
@@ -21,10 +22,9 @@ def locate(affine, rows, out):
     Returns how many were found.
     """
     nx, ny, nz = rows.shape
-    side = int(np.sqrt(out.shape[0]))
     found = 0
     for cell in range(out.shape[0]):
-        x, y = cell // side + 0.5, cell % side + 0.5
+        x, y = cell // _SIDE + 0.5, cell % _SIDE + 0.5
         for h in range(out.shape[1]):
             z = h + 0.5
             i = int(np.floor(affine[0, 0] * x + affine[0, 1] * y + affine[0, 2] * z + affine[0, 3] + _SNAP))
@@ -93,14 +93,36 @@ def merge_tiles(stamps, writers, payload, out_stamps, out_writers, out_payload):
 
 @kernel
 @no_type_check
-def _slot(table, side, x, y, z, heights):
+def _slot(table, x, y, z, heights):
     """Return slot, cell and height of map voxel (x, y, z) counted from the window's first tile; slot -1 if none."""
     if x < 0 or y < 0 or z < 0:
         return -1, 0, 0
-    f, i, j = z // heights, x // side, y // side
-    if f >= table.shape[0] or i >= table.shape[1] or j >= table.shape[2]:
+    floor, height = 0, z
+    if z >= heights:
+        floor = z // heights
+        height = z - floor * heights
+    i, j = x // _SIDE, y // _SIDE
+    if floor >= table.shape[0] or i >= table.shape[1] or j >= table.shape[2]:
         return -1, 0, 0
-    return table[f, i, j], (x % side) * side + y % side, z % heights
+    return table[floor, i, j], (x % _SIDE) * _SIDE + y % _SIDE, height
+
+
+@kernel
+@no_type_check
+def _set(codes, levels, weight, out):
+    """Write weight times the logits of a voxel to out; with `levels` they are codes, and centred here."""
+    count = out.shape[0]
+    if levels.shape[0] > 0:
+        mean = np.float32(0.0)
+        for c in range(count):
+            out[c] = levels[np.uint8(codes[c])]
+            mean += out[c]
+        mean /= np.float32(count)
+        for c in range(count):
+            out[c] = weight * (out[c] - mean)
+    else:
+        for c in range(count):
+            out[c] = weight * np.float32(codes[c])
 
 
 @kernel
@@ -128,7 +150,6 @@ def gather(affine, table, values, stamps, levels, fading, bilinear, start, stop,
     `fading` is (now, rate): a voxel weighs exp(-rate (now - stamp)). With `bilinear` the four columns around are
     mixed in x and y, by those of them that are known.
     """
-    side = int(np.sqrt(values.shape[1]))
     heights = values.shape[2]
     now, rate = fading
     _, ny, nz, count = out.shape
@@ -136,23 +157,23 @@ def gather(affine, table, values, stamps, levels, fading, bilinear, start, stop,
         for j in range(ny):
             for k in range(nz):
                 row = out[i, j, k]
-                for c in range(count):
-                    row[c] = 0.0
                 x, y, z = i + 0.5, j + 0.5, k + 0.5
                 u = affine[0, 0] * x + affine[0, 1] * y + affine[0, 2] * z + affine[0, 3] + _SNAP
                 v = affine[1, 0] * x + affine[1, 1] * y + affine[1, 2] * z + affine[1, 3] + _SNAP
                 w = affine[2, 0] * x + affine[2, 1] * y + affine[2, 2] * z + affine[2, 3] + _SNAP
                 iu, iv, iw = int(np.floor(u)), int(np.floor(v)), int(np.floor(w))
-                slot, cell, h = _slot(table, side, iu, iv, iw, heights)
+                slot, cell, h = _slot(table, iu, iv, iw, heights)
                 known = slot >= 0 and stamps[slot, cell, h] != 0
                 out_known[i, j, k] = known
-                if not known:
-                    continue
-                if not bilinear:
+                if known and not bilinear:
                     weight = np.float32(1.0)
                     if rate > 0.0:
                         weight = np.float32(np.exp(-rate * max(0.0, now - np.float64(stamps[slot, cell, h]))))
-                    _add(values, slot, cell, h, levels, weight, row)
+                    _set(values[slot, cell, h], levels, weight, row)
+                    continue
+                for c in range(count):
+                    row[c] = 0.0
+                if not known:
                     continue
                 iu, iv = int(np.floor(u - _SNAP - 0.5)), int(np.floor(v - _SNAP - 0.5))
                 fu, fv = u - _SNAP - 0.5 - iu, v - _SNAP - 0.5 - iv
@@ -160,7 +181,7 @@ def gather(affine, table, values, stamps, levels, fading, bilinear, start, stop,
                 for a in range(2):
                     for b in range(2):
                         share = (fu if a else 1.0 - fu) * (fv if b else 1.0 - fv)
-                        slot, cell, h = _slot(table, side, iu + a, iv + b, iw, heights)
+                        slot, cell, h = _slot(table, iu + a, iv + b, iw, heights)
                         if share > 0.0 and slot >= 0 and stamps[slot, cell, h] != 0:
                             total += share
                             if rate > 0.0:

@@ -19,8 +19,8 @@ class TileCache:
     def __init__(self, schema: MapSchema, limit: int) -> None:
         self.schema = schema
         heights, classes = schema.heights, schema.num_classes
-        self._dtype = np.uint8 if schema.dtype == "uint8" else np.float32
-        size = CELLS * heights * (8 + classes * np.dtype(self._dtype).itemsize)
+        self._whole = schema.dtype == "uint8"  # then whole records are kept, and values and stamps are views of them
+        size = CELLS * (schema.planes if self._whole else heights * (8 + classes * 4))
         self._slots: OrderedDict[Versions, int] = OrderedDict()
         self._seen: dict[str, dict[TileKey, bytes]] = {}
         self._allocate(max(1, limit // size))
@@ -44,9 +44,15 @@ class TileCache:
         self._free = [*range(len(self.stamps))]
 
     def _allocate(self, count: int) -> None:
-        heights = self.schema.heights
-        self.values = np.empty((count, CELLS, heights, self.schema.num_classes), dtype=self._dtype)
-        self.stamps = np.empty((count, CELLS, heights), dtype=np.uint64)
+        heights, classes = self.schema.heights, self.schema.num_classes
+        if self._whole:
+            self._records = np.empty((count, CELLS, self.schema.planes), dtype=np.uint8)
+            logits = self._records[..., 12 * heights : heights * (12 + classes)]
+            self.values = logits.reshape(count, CELLS, heights, classes)
+            self.stamps = self._records[..., : 8 * heights].view("<u8")
+        else:
+            self.values = np.empty((count, CELLS, heights, classes), dtype=np.float32)
+            self.stamps = np.empty((count, CELLS, heights), dtype=np.uint64)
         self._slots.clear()
         self._free = [*range(count)]
 
@@ -65,18 +71,25 @@ class TileCache:
         return [(key, tuple(entry)) for key, entry in zip(keys, found, strict=True)]
 
     def _fill(self, missing: list[Versions], layers: dict[str, Layer], slots: dict[Versions, int]) -> None:
-        parts: dict[str, dict[TileKey, Tile]] = {}
-        for prefix, layer in layers.items():
-            wanted = [key for key, sources in missing if any(p == prefix for p, _ in sources)]
-            if wanted:
-                parts[prefix] = layer.read(wanted)
+        """Read what is missing, each into a slot, and enter it in `slots`."""
+        new = {key: self._free.pop() if self._free else self._evict(slots) for key, _ in missing}
+        try:
+            parts: dict[str, dict[TileKey, Tile]] = {}
+            for prefix, layer in layers.items():
+                wanted = {key: sources[0][0] for key, sources in missing if any(p == prefix for p, _ in sources)}
+                own = {key: self._records[new[key]] for key, at in wanted.items() if at == prefix and self._whole}
+                if wanted:
+                    parts[prefix] = layer.read(wanted, into=own)
+            for key, sources in missing:
+                tile = merged([parts[prefix][key] for prefix, _ in sources])
+                if not self._whole:
+                    self.stamps[new[key]] = tile.stamps
+                    self.values[new[key]] = self.schema.decode(tile.payload)
+        except BaseException:
+            self._free += new.values()
+            raise
         for version in missing:
-            key, sources = version
-            tile = merged([parts[prefix][key] for prefix, _ in sources])
-            slot = self._free.pop() if self._free else self._evict(slots)
-            self.stamps[slot] = tile.stamps
-            self.values[slot] = tile.payload if self._dtype == np.uint8 else self.schema.decode(tile.payload)
-            self._slots[version] = slots[version] = slot
+            self._slots[version] = slots[version] = new[version[0]]
 
     def _evict(self, in_use: dict[Versions, int]) -> int:
         for version in self._slots:

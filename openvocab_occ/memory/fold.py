@@ -10,11 +10,13 @@ from openvocab_occ._jit import in_slices
 from openvocab_occ.errors import ConfigError, MapError
 from openvocab_occ.memory import journal
 from openvocab_occ.memory._tiles_kernels import merge_rows
+from openvocab_occ.memory.clock import ticks_of
+from openvocab_occ.memory.footprint import tile_rows
 from openvocab_occ.memory.journal import Entry, EntryName
 from openvocab_occ.memory.layer import Layer, TileKey
 from openvocab_occ.memory.schema import CELLS, MapSchema, Tile
 from openvocab_occ.memory.store import Location, agent_number
-from openvocab_occ.memory.tile_map import TileMap, ticks_of, tile_rows
+from openvocab_occ.memory.tile_map import TileMap
 from openvocab_occ.memory.window import Window
 
 FoldPolicy = Literal["newest", "bayes", "ema"]
@@ -30,8 +32,9 @@ class FoldConfig:
     write were independent evidence. `ema`: an exponential mean."""
     half_life: float | None = None
     """Of `bayes`: seconds after which evidence counts half; None for never."""
-    limit: float = 20.0
-    """Of `bayes`: no logit grows beyond it, so that a changed world is believed again after some writes."""
+    limit: float = 8.0
+    """Of `bayes`: no class falls further below the best one, so that a changed world is believed after some looks. A
+    `uint8` map keeps no more than 9."""
     weight: float = 0.3
     """Of `ema`: share of a new write."""
 
@@ -223,7 +226,9 @@ class _Evidence:
             if self._fold.half_life is not None:
                 age = (entry.stamp - before.astype(np.float64)) / 1000
                 old = old * np.exp2(-age / self._fold.half_life).astype(np.float32)[:, None]
-            mixed = np.clip(old + new, -self._fold.limit, self._fold.limit)
+            mixed = old + new
+            mixed -= mixed.max(axis=-1, keepdims=True)
+            np.maximum(mixed, -self._fold.limit, out=mixed)
         self._state[hit] = mixed
         self._tile.stamps[hit] = entry.stamp
         self._tile.writers[hit] = agent_number(entry.agent)

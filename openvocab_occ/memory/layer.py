@@ -2,7 +2,7 @@
 
 import random
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -73,20 +73,21 @@ class Layer:
             futures = [(key, self._kv.read(chunk_name(key))) for key in self.stored()]
             return {key: len(future.result().value) for key, future in futures}
 
-    def read(self, keys: Iterable[TileKey]) -> dict[TileKey, Tile]:
-        """Return tiles; those never written are empty.
+    def read(self, keys: Iterable[TileKey], *, into: Mapping[TileKey, np.ndarray] | None = None) -> dict[TileKey, Tile]:
+        """Return tiles; those never written are empty. Those that `into` has a record for are read into that.
 
         Raises:
             MapError: A stored tile is damaged.
         """
         wanted = [*keys]
         futures = [_part(self._array, key).read(order="C") for key in wanted]
-        tiles = [Tile(self.schema, np.empty((TILE * TILE, self.schema.planes), np.uint8)) for _ in wanted]
+        given = into or {}
+        tiles = [Tile(self.schema, given[key] if key in given else self._record()) for key in wanted]
 
         def unpack(start: int, stop: int) -> None:
             for n in range(start, stop):
                 with translated(self._at(wanted[n])):
-                    transposed(_flat(futures[n].result()), tiles[n].record.view("<u8"))
+                    transposed(_words(futures[n].result()), tiles[n].record.view("<u8"))
 
         in_slices(unpack, len(wanted))
         return dict(zip(wanted, tiles, strict=True))
@@ -146,9 +147,9 @@ class Layer:
 
         def alter(start: int, stop: int) -> None:
             for n in range(start, stop):
-                tile = Tile(self.schema, np.empty((TILE * TILE, self.schema.planes), np.uint8))
+                tile = Tile(self.schema, self._record())
                 with translated(self._at(keys[n])):
-                    transposed(_flat(futures[n].result()), tile.record.view("<u8"))
+                    transposed(_words(futures[n].result()), tile.record.view("<u8"))
                 counts[keys[n]] = change(keys[n], tile)
                 if counts[keys[n]]:
                     with translated(self._at(keys[n])):
@@ -159,9 +160,12 @@ class Layer:
         in_slices(alter, len(keys))
         return counts
 
+    def _record(self) -> np.ndarray:
+        return np.empty((TILE * TILE, self.schema.planes), np.uint8)
+
     def _packed(self, tile: Tile) -> np.ndarray:
         planes = np.empty((self.schema.planes, TILE * TILE), np.uint8)
-        transposed(tile.record, planes.view("<u8"))
+        transposed(tile.record.view("<u8"), planes.view("<u8"))
         return planes.reshape(-1, TILE, TILE)
 
     def _at(self, key: TileKey) -> str:
@@ -197,5 +201,6 @@ def _part(array: Any, key: TileKey) -> Any:
     return array[key.floor + ORIGIN[0], :, x : x + TILE, y : y + TILE]
 
 
-def _flat(planes: np.ndarray) -> np.ndarray:
-    return planes.reshape(len(planes), TILE * TILE)
+def _words(planes: np.ndarray) -> np.ndarray:
+    """Return planes as rows of eight bytes each."""
+    return planes.reshape(len(planes), TILE * TILE).view("<u8")

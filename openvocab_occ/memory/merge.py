@@ -10,10 +10,11 @@ from openvocab_occ.errors import ConfigError
 from openvocab_occ.memory import journal
 from openvocab_occ.memory._tiles_kernels import merge_tiles
 from openvocab_occ.memory.changes import centers
-from openvocab_occ.memory.layer import TileKey
+from openvocab_occ.memory.footprint import tile_rows
+from openvocab_occ.memory.layer import Layer, TileKey
 from openvocab_occ.memory.schema import CELLS, Tile
 from openvocab_occ.memory.store import agent_number
-from openvocab_occ.memory.tile_map import TileMap, tile_rows
+from openvocab_occ.memory.tile_map import TileMap
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,19 +50,11 @@ def surface(city: TileMap, *, exclude_logs: Collection[str] = ()) -> Surface:
 def merge(target: TileMap, source: TileMap) -> int:
     """Put a map of the same lattice into another, log by log; return the tiles touched. May be repeated.
 
-    Journals are copied first. The greatest record of each voxel stays, so the order of merges does not matter.
+    The journal is copied first. The greatest record of each voxel stays, so the order of merges does not matter.
     """
     if target.schema != source.schema:
         raise ConfigError("the maps have another lattice, classes or dtype", expected=target.schema, got=source.schema)
-    for agent, reason in source.agents().items():
-        if target.agents().get(agent) is None:
-            target.admit(agent)
-        if reason:
-            target.quarantine(agent, reason)
-    for name in journal.names(source.store):
-        content = source.store.read(name.key)
-        if content is not None:
-            target.store.write(name.key, content)
+    merge_journal(target, source)
     touched = 0
     ours, merged = target.logs(), source.logs()
     for log, into_base in merged.items():
@@ -72,18 +65,35 @@ def merge(target: TileMap, source: TileMap) -> int:
     for theirs, mine in pairs:
         keys = theirs.stored()
         for start in range(0, len(keys), 32):
-            tiles = theirs.read(keys[start : start + 32])
-
-            def change(key: TileKey, tile: Tile, tiles: dict[TileKey, Tile] = tiles) -> int:
-                new = tiles[key]
-                return merge_tiles(new.stamps, new.writers, new.payload, tile.stamps, tile.writers, tile.payload)
-
-            mine.update(tiles, change)
+            put_tiles(mine, theirs.read(keys[start : start + 32]))
         touched += len(keys)
     for log, into_base in merged.items():
         if into_base and log not in ours:
             target.mark_consolidated(log)
     return touched
+
+
+def merge_journal(target: TileMap, source: TileMap) -> None:
+    """Copy the register of agents and the journal, which come before the tiles."""
+    for agent, reason in source.agents().items():
+        if target.agents().get(agent) is None:
+            target.admit(agent)
+        if reason:
+            target.quarantine(agent, reason)
+    for name in journal.names(source.store):
+        content = source.store.read(name.key)
+        if content is not None:
+            target.store.write(name.key, content)
+
+
+def put_tiles(layer: Layer, tiles: dict[TileKey, Tile]) -> int:
+    """Merge tiles into a layer, durably; return how many records changed."""
+
+    def change(key: TileKey, tile: Tile) -> int:
+        new = tiles[key]
+        return merge_tiles(new.stamps, new.writers, new.payload, tile.stamps, tile.writers, tile.payload)
+
+    return layer.update(tiles, change)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,19 +23,24 @@ ORIGIN = (512, 2**20, 2**20)
 """Chunk (floor, x, y) of the tile whose lower corner is the world's origin; tiles left of it have smaller numbers."""
 SHAPE = (1024, 2**21, 2**21)
 """Chunks along floor, x and y: 53,687 km at 0.4 m, more than the way around the Earth."""
-FORMAT = 1
+FORMAT = 2
 FREE = "free"
 
 DType = Literal["uint8", "float16", "float32"]
 TOP = 127
-"""The uint8 code of the largest class of a voxel; another of its classes has TOP sqrt(p / p_max), rounded, and less.
+"""The uint8 code of the largest class of a voxel; another of its classes has TOP (p / p_max)^(2/3), rounded, and less.
 
-Equal steps of sqrt(p) spend the bits where probabilities are large; none is off by more than about 0.005.
+Equal steps of a power of p spend the bits where probabilities are large. The power is a trade of bytes for the
+small ones: on the noise of the simulated streets 1/2 takes 17 % more bytes and errs by up to 0.006 of a probability,
+2/3 by 0.009, 3/4 takes 7 % fewer and errs by 0.010.
 """
-REACH = 12.0
-"""What code 0 stands for: a log-probability this far below the largest."""
-LEVELS = np.maximum(2 * np.log(np.arange(256).clip(1e-9, TOP) / TOP), -REACH).astype(np.float32)
+POWER = 2 / 3
+REACH = 9.0
+"""What code 0 stands for: a log-probability this far below the largest. All that is more than 8.3 below gets it."""
+LEVELS = np.maximum(np.log(np.arange(256).clip(1e-9, TOP) / TOP) / POWER, -REACH).astype(np.float32)
 """What each code stands for, relative to the largest class."""
+_STEPS = 4096  # table entries for each unit of log-probability: codes are off by 0.02 before they are rounded
+_CODES = np.minimum(np.rint(TOP * np.exp(-POWER * np.arange(9 * _STEPS) / _STEPS)), TOP - 1).astype(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -100,7 +105,7 @@ class MapSchema:
             "writer": f"the next {4 * heights}: uint32 of each height, the agent's name stands in agents/ in hex",
             "logits": f"the next {size}: [height, class] {self.dtype}",
         }
-        value = "max(2 ln(code / top), -reach), less its mean over the classes"
+        value = "max(ln(code / top) / power, -reach), less its mean over the classes"
         return {
             "openvocab_occ": {
                 "kind": "tile map",
@@ -111,7 +116,9 @@ class MapSchema:
                 "origin_chunk": dict(zip(("floor", "x", "y"), ORIGIN, strict=True)),
                 "byte_order": "little",
                 "planes": planes,
-                "quantiser": {"top": TOP, "reach": REACH, "value": value} if self.dtype == "uint8" else None,
+                "quantiser": {"top": TOP, "power": POWER, "reach": REACH, "value": value}
+                if self.dtype == "uint8"
+                else None,
             }
         }
 
@@ -139,15 +146,15 @@ class MapSchema:
             DataError: A logit is not finite.
         """
         rows = np.ascontiguousarray(logits, dtype=np.float32)
-        bad = np.flatnonzero(~np.isfinite(rows).all(axis=1)) if rows.size else np.empty(0)
-        if bad.size:
+        if not np.isfinite(rows.sum(dtype=np.float64)):  # in float64 no sum of finite float32 overflows
+            bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
             raise DataError(
                 "logits under the mask are not finite", expected="numbers",
                 got=f"NaN or infinity in {bad.size} of {len(rows)} voxels", fix="clip log(0) to -30, say",
             )  # fmt: skip
         if self.dtype == "uint8":
             codes = np.empty(rows.shape, dtype=np.uint8)
-            in_slices(lambda a, b: quantise(rows, TOP, a, b, codes), len(rows), grain=8192)
+            in_slices(lambda a, b: quantise(rows, _CODES, np.float32(_STEPS), TOP, a, b, codes), len(rows), grain=8192)
             return codes
         with np.errstate(over="ignore"):
             centred = (rows - rows.mean(axis=1, keepdims=True)).astype(self.dtype)

@@ -1,8 +1,6 @@
 """`TileMap`: the long-term memory of a city, written by many vehicles, read as a prior (LMPOcc III-B, III-D)."""
 
-import math
 import threading
-import time
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -16,16 +14,17 @@ from openvocab_occ.arrays import ArrayLike, check_shape
 from openvocab_occ.errors import AlreadyExistsError, ConfigError, DataError, NotFoundError, StorageError
 from openvocab_occ.geometry import GridSpec
 from openvocab_occ.memory import journal
-from openvocab_occ.memory._tiles_kernels import gather, locate, merge_rows, merge_tiles
+from openvocab_occ.memory._tiles_kernels import gather, merge_rows, merge_tiles
 from openvocab_occ.memory.cache import TileCache, merged
+from openvocab_occ.memory.clock import fading_rate, ticks_of
+from openvocab_occ.memory.footprint import tile_rows
 from openvocab_occ.memory.layer import Layer, TileKey
-from openvocab_occ.memory.schema import CELLS, LEVELS, DType, MapSchema, Tile
+from openvocab_occ.memory.schema import LEVELS, DType, MapSchema, Tile
 from openvocab_occ.memory.store import Location, Store, agent_number, safe_name
 from openvocab_occ.memory.window import Prior, Window
 
 Policy = Literal["newest", "replace"]
 Interpolation = Literal["nearest", "bilinear"]
-CLOCK_TOLERANCE = 300.0  # s; a stamp further ahead would keep later writes of everyone out until then
 _CACHE_BYTES = 256 * 2**20
 _BASE = "base/"
 _LOGS = "logs/"
@@ -135,7 +134,7 @@ class TileMap:
         """
         if interpolation not in ("nearest", "bilinear"):
             raise ConfigError("interpolation is not known", expected="nearest or bilinear", got=interpolation)
-        fading = _fading(half_life, now)
+        fading = fading_rate(half_life, now)
         window = Window(T_world_ego, spec, self.schema)
         logits = np.empty((*spec.shape, self.schema.num_classes), dtype=np.float32)
         known = np.empty(spec.shape, dtype=np.bool_)
@@ -200,6 +199,22 @@ class TileMap:
             StorageError: The store is full, read-only or fought over; the map is as before, or has part of the tiles,
                 and writing again completes them.
         """
+        ready = self.prepare(logits, mask, T_world_ego, spec, stamp=stamp, agent=agent, log=log, policy=policy)
+        return self.put([ready])
+
+    def prepare(
+        self,
+        logits: Float[np.ndarray, "x y z classes"],
+        mask: Bool[np.ndarray, "x y z"],
+        T_world_ego: ArrayLike,
+        spec: GridSpec,
+        *,
+        stamp: float,
+        agent: str,
+        log: str,
+        policy: Policy = "newest",
+    ) -> journal.Entry:
+        """Check and encode a write, so that `put` can do it later; its arguments, and what it raises, are `write`'s."""
         shape = spec.shape
         check_shape(logits, (*shape, self.schema.num_classes), "logits")
         check_shape(mask, shape, "mask")
@@ -213,27 +228,38 @@ class TileMap:
         window = Window(T_world_ego, spec, self.schema)
         ticks = ticks_of(stamp)
         safe_name(log, "log")
+        safe_name(agent, "agent")
         flat = np.flatnonzero(mask)
         codes = self.schema.encode(logits.reshape(-1, logits.shape[-1])[flat])
-        self.admit(agent)
-        entry = journal.Entry(window.T_world_ego, spec, flat, codes, ticks, agent, log, policy)
-        if self.schema.journal and len(flat):
-            journal.append(self.store, entry)
-        return self.apply(entry)
+        return journal.Entry(window.T_world_ego, spec, flat, codes, ticks, agent, log, policy)
 
-    def apply(self, entry: journal.Entry) -> Written:
-        """Put a write into the tiles, without journal."""
-        rows_of = tile_rows(entry, self.schema)
-        number, force = agent_number(entry.agent), entry.policy == "replace"
+    def put(self, entries: Sequence[journal.Entry]) -> Written:
+        """Write what was prepared, all of one log and in this order, as `write` does; each tile is committed once."""
+        for agent in {entry.agent for entry in entries}:
+            self.admit(agent)
+        if self.schema.journal:
+            for entry in entries:
+                if len(entry.flat):
+                    journal.append(self.store, entry)
+        return self.apply(entries)
+
+    def apply(self, entries: Sequence[journal.Entry]) -> Written:
+        """Put writes of one log into the tiles, without journal."""
+        footprints = [(entry, tile_rows(entry, self.schema)) for entry in entries]
+        keys = dict.fromkeys(key for _, rows in footprints for key in rows)
 
         def change(key: TileKey, tile: Tile) -> int:
-            return merge_rows(
-                rows_of[key], entry.codes, np.uint64(entry.stamp), np.uint32(number), force,
-                tile.stamps, tile.writers, tile.payload,
+            return sum(
+                merge_rows(
+                    rows[key], entry.codes, np.uint64(entry.stamp), np.uint32(agent_number(entry.agent)),
+                    entry.policy == "replace", tile.stamps, tile.writers, tile.payload,
+                )
+                for entry, rows in footprints if key in rows
             )  # fmt: skip
 
-        changed = self.overlay(entry.log).update(rows_of, change) if rows_of else 0
-        return Written(sum(int((rows >= 0).sum()) for rows in rows_of.values()), changed, len(rows_of))
+        changed = self.overlay(entries[0].log).update(keys, change) if keys else 0
+        reached = sum(int((part >= 0).sum()) for _, rows in footprints for part in rows.values())
+        return Written(reached, changed, len(keys))
 
     def admit(self, agent: str) -> None:
         """Enter an agent into the register, or refuse it."""
@@ -342,52 +368,6 @@ class TileMap:
             if prefix not in self._layers:
                 self._layers[prefix] = Layer(self.store, prefix, self.schema)
             return self._layers[prefix]
-
-
-def tile_rows(
-    entry: journal.Entry, schema: MapSchema, only: Collection[TileKey] | None = None
-) -> dict[TileKey, np.ndarray]:
-    """Return for each tile that a write touches int32[cells, heights]: the row of its codes for a voxel, else -1."""
-    if not len(entry.flat):
-        return {}
-    window = Window(entry.T_world_ego, entry.spec, schema)
-    rows = entry.rows()
-    keys = [key for key in window.tiles() if only is None or key in only]
-    found: dict[TileKey, np.ndarray] = {}
-
-    def work(start: int, stop: int) -> None:
-        for key in keys[start:stop]:
-            out = np.empty((CELLS, schema.heights), dtype=np.int32)
-            if locate(window.to_grid(key), rows, out):
-                found[key] = out
-
-    in_slices(work, len(keys))
-    return {key: found[key] for key in keys if key in found}
-
-
-def ticks_of(stamp: float) -> int:
-    """Return Unix seconds as records keep them: milliseconds plus 1.
-
-    Raises:
-        ConfigError: It is no time, before 1970, or further in the future than clocks differ.
-    """
-    latest = time.time() + CLOCK_TOLERANCE
-    if not (math.isfinite(stamp) and 0 <= stamp <= latest):
-        raise ConfigError(
-            "stamp is not a time at which something was seen",
-            expected=f"Unix seconds from 0 to {latest:.0f}, five minutes from now", got=stamp,
-            fix="set the vehicle's clock",
-        )  # fmt: skip
-    return round(stamp * 1000) + 1
-
-
-def _fading(half_life: float | None, now: float | None) -> tuple[float, float]:
-    """Return now in ticks and the rate per tick, 0 for none."""
-    if half_life is None:
-        return 0.0, 0.0
-    if not half_life > 0:
-        raise ConfigError("half_life is not usable", expected="seconds above 0", got=half_life)
-    return (time.time() if now is None else now) * 1000.0 + 1, math.log(2) / (half_life * 1000.0)
 
 
 def _overlay(log: str) -> str:

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from openvocab_occ.memory import journal
+from openvocab_occ.memory.footprint import tile_rows
 from openvocab_occ.memory.layer import TileKey
-from openvocab_occ.memory.tile_map import TileMap, tile_rows
+from openvocab_occ.memory.tile_map import TileMap
 
 _LEAST = 500  # voxels seen by others too, below which nothing is said
 

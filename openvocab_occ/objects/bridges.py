@@ -8,7 +8,10 @@ from openvocab_occ.objects.box import principal_yaw
 from openvocab_occ.objects.kinds import plausible_length
 
 VALLEY = 0.55
-"""A cross section counts as a neck when it holds at most this share of the voxels of the fullest on either side."""
+"""A cross section of what is too long for one thing counts as a neck when it holds at most this share of the voxels of
+the fullest on either side."""
+GAP = 0.15
+"""The same of what may be one thing, for a truck has a neck of its own behind the cab."""
 TOO_LONG = 1.25
 """Times its greatest plausible length from which a thing is surely more than one."""
 _SLACK = 0.8  # metres by which voxels make a thing look longer
@@ -18,8 +21,9 @@ def cut_bridge(packed: Int64[np.ndarray, " n"], name: str, voxel_size: float) ->
     """Return the voxels of each thing that a segment of things called `name` is made of, along its length.
 
     A segment is cut at the emptiest cross section that leaves a plausible length of such a thing on both sides and is a
-    neck, or, where the whole is far too long for one, at the emptiest whatever it holds. Names without a plausible
-    length are never cut. The pieces are cut again.
+    neck, or, where the whole is far too long for one, at the emptiest whatever it holds; where the whole is no longer
+    than one can be, only where hardly anything is left. Names without a plausible length are never cut. The pieces are
+    cut again.
     """
     lengths = plausible_length(name)
     if lengths is None or len(packed) < 8:
@@ -36,15 +40,15 @@ def cut_bridge(packed: Int64[np.ndarray, " n"], name: str, voxel_size: float) ->
     edge = max(round((least - _SLACK) / voxel_size), 1)
     if len(filled) < 2 * edge + 1:
         return [packed]
-    # slices of a turned lattice hold now more, now fewer voxels
+    length = len(filled) * voxel_size
+    # slices of a turned lattice hold now more, now fewer voxels, so necks are those of their mean; gaps are clear
     smooth = np.convolve(np.pad(filled, 1, mode="edge"), np.ones(3) / 3, mode="valid")
-    inner = smooth[edge : len(smooth) - edge]
-    at = edge + int(inner.argmin())
+    profile, valley = (smooth, VALLEY) if length > greatest + _SLACK else (filled, GAP)
+    at = edge + int(profile[edge : len(profile) - edge].argmin())
     peak = min(smooth[:at].max(), smooth[at:].max())
-    long = len(filled) * voxel_size > greatest * TOO_LONG + _SLACK
-    if smooth[at] > VALLEY * peak and not long:
+    if profile[at] > valley * peak and length <= greatest * TOO_LONG + _SLACK:
         return [packed]
-    left = slices < at if smooth[at] > VALLEY * peak else slices <= at
+    left = slices < at if profile[at] > valley * peak else slices <= at
     return [
         piece
         for side in (packed[left], packed[~left])

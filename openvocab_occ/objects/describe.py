@@ -71,7 +71,7 @@ def describe(
         embedding=embedding,
         state=state,
         parent=0,
-        views=tuple(Sighting(c.frame, c.view, c.box) for c in crops),
+        views=tuple(Sighting(c.frame, c.view, c.box, c.score) for c in crops),
         evidence=evidence,
         confidence=confidence,
         heading=heading,
@@ -90,7 +90,10 @@ def motion_of(track: Track, voxels: VoxelMap, config: StateConfig | None = None)
     assert track.first is not None, "a track has sightings"
     assert track.last is not None, "a track has sightings"
     keys = unpack(np.union1d(track.first.seen, track.last.seen))
-    return replace(track.motion(config), left=float((voxels.free.count(keys) > 0).mean()))
+    at = voxels.index(keys)
+    hits = np.where(at >= 0, voxels.count[at], 0) if len(voxels) else np.zeros(len(keys))
+    through = voxels.free.count(keys).astype(np.int64)
+    return replace(track.motion(config), left=float(((through > 0) & (2 * through >= hits)).mean()))
 
 
 def state_of(
@@ -118,9 +121,7 @@ def fit_box(track: Track, packed: Int64[np.ndarray, " n"], heading: float | None
     Of a moving thing the latest sighting and its heading count. Length >= width.
     """
     size = track.voxel_size
-    bodies = track.bodies[-1:] if track.moved else track.bodies
-    keys, counts = np.unique(np.concatenate(bodies), return_counts=True) if bodies else (packed, np.ones(len(packed)))
-    points = (unpack(np.union1d(packed, keys[2 * counts > len(bodies)])) + 0.5) * size
+    points = (unpack(np.union1d(packed, track.body)) + 0.5) * size
     yaw = heading if heading is not None else _yaw(np.unique(points[:, :2], axis=0), size)
     yaw = (yaw + np.pi / 2) % np.pi - np.pi / 2
     c, s = np.cos(yaw), np.sin(yaw)

@@ -48,6 +48,8 @@ class FrameVoxels:
     window: OccupancyGrid | None = field(default=None, repr=False)
     """The frame's grid, which tells where its knowledge ends."""
     views: tuple[PixelRows, ...] = field(default=(), repr=False)
+    masks: Int32[np.ndarray, " s"] | None = field(default=None, repr=False)
+    """Of the seen voxels, where a model puts out masks: view * 65536 + number of the mask; -1 for none."""
 
 
 def gather(
@@ -89,6 +91,10 @@ def gather(
     named[inverse[light_first]] = labels[row[light_first]]
     at = np.full(len(labels) + 1, -1, dtype=np.int32)  # the voxel a pixel of each row is about; the last row is none
     at[row[light_first]] = inverse[light_first]
+    masks = None
+    if lifted.mask is not None:
+        masks = np.full(len(packed), -1, dtype=np.int32)
+        masks[inverse[light_first]] = lifted.mask[row[light_first]]
     everything, everywhere = packed, named
     if grid is not None and len(grid.class_names) > 2:
         hidden, classes = _hidden(grid, packed, voxel_size)
@@ -108,6 +114,7 @@ def gather(
         labels=everywhere,
         window=grid,
         views=tuple(_pixel_rows(views, at)),
+        masks=masks,
     )
 
 

@@ -14,12 +14,15 @@ from openvocab_occ.objects.scene_map import KeyFrame, NamedCamera
 from openvocab_occ.objects.tree import SceneObject, Sighting, without
 
 VECTOR = pa.list_(pa.float64())
+_SIGHTING = pa.struct([
+    ("frame", pa.int32()), ("view", pa.string()), ("box", pa.list_(pa.int32())), ("score", pa.float64()),
+])  # fmt: skip
 _OBJECTS = pa.schema([
     ("id", pa.int32()), ("level", pa.string()), ("parent", pa.int32()), ("children", pa.list_(pa.int32())),
     ("label", pa.string()), ("score", pa.float64()), ("state", pa.string()),
     ("center", VECTOR), ("size", VECTOR), ("yaw", pa.float64()),
     ("embedding", pa.list_(pa.float32())), ("voxels", pa.list_(pa.int64())),
-    ("views", pa.list_(pa.struct([("frame", pa.int32()), ("view", pa.string()), ("box", pa.list_(pa.int32()))]))),
+    ("views", pa.list_(_SIGHTING)),
     ("evidence", pa.string()), ("confidence", pa.float64()), ("heading", pa.float64()), ("speed", pa.float64()),
     ("times_seen", pa.int64()), ("first_seen", pa.float64()), ("last_seen", pa.float64()), ("agreement", pa.float64()),
     ("names", pa.list_(pa.struct([("name", pa.string()), ("score", pa.float64())]))),
@@ -109,7 +112,7 @@ def layers_of(table: pa.Table, dim: int) -> tuple[DynamicLayer, ...]:
 
 def _object_row(node: SceneObject) -> dict[str, Any]:
     same = {name: getattr(node, name) for name in ("id", "level", "parent", "children", "label", "score", "state")}
-    views = [{"frame": view.frame, "view": view.view, "box": list(view.box)} for view in node.views]
+    views = [{**view._asdict(), "box": list(view.box)} for view in node.views]
     box = {"center": node.box.center, "size": node.box.size, "yaw": node.box.yaw}
     more = {name: getattr(node, name) for name in _EVIDENCE}
     names = [{"name": name, "score": score} for name, score in node.names]
@@ -135,7 +138,7 @@ def _object(row: Mapping[str, Any], positions: np.ndarray, voxels: VoxelMap) -> 
         points=points.astype(np.float32),
         embedding=embedding,
         children=tuple(row["children"]),
-        views=tuple(Sighting(view["frame"], view["view"], tuple(view["box"])) for view in row["views"]),
+        views=tuple(Sighting(**(view | {"box": tuple(view["box"])})) for view in row["views"]),
         names=tuple((name["name"], name["score"]) for name in row["names"]),
         best_embedding=None if best is None else np.asarray(best, dtype=np.float32),
     )

@@ -5,7 +5,8 @@ rest. Columns and features are read when they are first asked for; their pages c
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Int64
 
 from openvocab_occ.errors import AlreadyExistsError, ConfigError, MapError, OpenVocabOccError, StorageError
 from openvocab_occ.io.files import PathLike, existing, sha256, written_folder
@@ -22,7 +23,7 @@ from openvocab_occ.mapping.keys import pack_axes, packable
 from openvocab_occ.objects.feature_table import feature_table
 from openvocab_occ.objects.map_rows import frame_table, frames_of, layer_table, layers_of, object_table, objects_of
 from openvocab_occ.objects.scene_map import EncoderInfo, Provenance, SceneMap
-from openvocab_occ.objects.tree import ObjectTree
+from openvocab_occ.objects.tree import ObjectTree, SceneObject
 
 FORMAT = "openvocab_occ.map"
 VERSION = 1
@@ -33,8 +34,8 @@ FILES = (
 MAX_COSINE_ERROR = 0.01
 """How far a stored feature may be from the voxel's own, by default: a match of cosine 0.3 moves by at most 0.14, one of
 neighbours that share a vector by what they differ anyway."""
-HASHED_AT_ONCE = 1 << 28
-"""Bytes up to which a file is hashed when the map is opened (0.15 s); larger ones are by `verify_map` and, page by
+HASHED_AT_ONCE = 1 << 24
+"""Bytes up to which a file is hashed when the map is opened (0.01 s); larger ones are by `verify_map` and, page by
 page, when they are read."""
 _ROW_GROUP = 1 << 16
 _AXES = ("x", "y", "z")
@@ -111,15 +112,28 @@ def read_map(path: PathLike, *, region: Float[np.ndarray, "2 3"] | None = None) 
     manifest = read_manifest(folder)
     for name in FILES:
         _check_file(folder, name, manifest)
-    try:
+    with _consistent(folder):
         info = manifest["encoder"]
         encoder = EncoderInfo(**(info | {"labels": tuple(info["labels"])}))
         voxels, rows = _voxels(folder, manifest, encoder, region)
-        nodes = objects_of(_table(folder, "objects.parquet"), voxels, rows, manifest["counts"]["voxels"])
+        count = int(manifest["counts"]["voxels"])
+
+        def nodes() -> list[SceneObject]:
+            with _consistent(folder):
+                found = objects_of(_table(folder, "objects.parquet"), voxels, rows, count)
+                return list(ObjectTree(found).nodes)
+
         frames = frames_of(_table(folder, "frames.parquet"))
         layers = layers_of(_table(folder, "dynamic.parquet"), encoder.dim)
         names, provenance = tuple(manifest["class_names"]), Provenance(**manifest["provenance"])
-        return SceneMap(voxels, ObjectTree(nodes), encoder, frames, provenance, names, layers)
+        return SceneMap(voxels, ObjectTree.stored(nodes), encoder, frames, provenance, names, layers)
+
+
+@contextmanager
+def _consistent(folder: Path) -> Iterator[None]:
+    """Turn whatever goes wrong with the content of a map into MapError."""
+    try:
+        yield
     except (MapError, ConfigError):
         raise
     except (KeyError, TypeError, ValueError, IndexError, OSError, pa.ArrowException, OpenVocabOccError) as error:
@@ -162,6 +176,7 @@ def verify_map(path: PathLike) -> dict[str, Any]:
     for name in FILES:
         _check_file(folder, name, manifest, hash_all=True)
     scene = read_map(folder)
+    _, _, _ = scene.voxels.keys, scene.voxels.free, scene.objects.nodes
     columns = scene.voxels.columns()
     features = scene.voxels.features
     bad = [name for name in ("weight", "agreement", "first_seen", "last_seen") if not np.isfinite(columns[name]).all()]
@@ -245,31 +260,52 @@ def _space_table(space: FreeSpace) -> pa.Table:
 def _voxels(
     folder: Path, manifest: Mapping[str, Any], encoder: EncoderInfo, region: Float[np.ndarray, "2 3"] | None
 ) -> tuple[VoxelMap, Int64[np.ndarray, " n"] | None]:
-    """Return the voxels, whose columns are read when asked for, and which rows of the file they are; None for all."""
+    """Return the voxels, which are read when asked for, and which rows of the file they are; None for all."""
     size, name = float(manifest["voxel_size"]), "voxels.parquet"
-    groups = None if region is None else _groups(folder / name, region, size)
-    table = _table(folder, name, list(_AXES), groups)
-    axes = [table[axis].to_numpy().astype(np.int32, copy=False) for axis in _AXES]
-    packed = pack_axes(*axes)
+    count, groups, inside, rows = int(manifest["counts"]["voxels"]), None, None, None
+    if region is not None:
+        groups, rows, inside = _inside(folder / name, region, size)
+        count = len(rows)
+    read = _reader(folder, encoder.dim, groups, inside)
+
+    def space() -> FreeSpace:
+        with _consistent(folder):
+            table = _table(folder, "space.parquet")
+            blocks = np.stack([table[axis].to_numpy() for axis in _AXES], axis=1).astype(np.int32)
+            return FreeSpace.from_blocks(size, blocks, _rows_of(table["counts"], 512))
+
+    voxels = VoxelMap.stored(
+        size, encoder.dim, count, read, free=space, contract=encoder.contract, num_classes=int(manifest["num_classes"])
+    )
+    return voxels, rows
+
+
+def _keys(folder: Path, groups: list[int] | None) -> tuple[np.ndarray, ...]:
+    """Return x, y, z of the voxels of all row groups, or some, once they are known to be in order."""
+    table = _table(folder, "voxels.parquet", list(_AXES), groups)
+    axes = tuple(table[axis].to_numpy().astype(np.int32, copy=False) for axis in _AXES)
     ends = np.array([[a.min(initial=0), a.max(initial=0)] for a in axes], dtype=np.int32).T
+    packed = pack_axes(*axes)
     if not packable(ends).all() or (packed[1:] <= packed[:-1]).any():
         raise MapError("voxel keys repeat, are too large or out of order", got=folder, fix="rebuild the map")
-    inside = rows = None
-    if region is not None and groups is not None:
-        centers = (np.stack(axes, axis=1) + 0.5) * size
-        inside = ((centers >= region[0]) & (centers < region[1])).all(axis=1)
-        with pq.ParquetFile(folder / name) as file:
-            lengths = [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)]
-        first = np.cumsum([0, *lengths])
-        rows = np.concatenate([np.arange(first[g], first[g + 1]) for g in groups] or [first[:0]])[inside]
-        packed = packed[inside]
-    read = _reader(folder, encoder.dim, groups, inside)
-    classes = int(manifest["num_classes"])
-    voxels = VoxelMap.stored(size, encoder.dim, packed, read, contract=encoder.contract, num_classes=classes)
-    space = _table(folder, "space.parquet")
-    blocks = np.stack([space[axis].to_numpy() for axis in _AXES], axis=1).astype(np.int32)
-    voxels.free = FreeSpace.from_blocks(size, blocks, _rows_of(space["counts"], 512))
-    return voxels, rows
+    return (*axes, packed)
+
+
+def _inside(
+    path: Path, region: Float[np.ndarray, "2 3"], size: float
+) -> tuple[list[int], Int64[np.ndarray, " n"], Bool[np.ndarray, " m"]]:
+    """Return the row groups that meet a region, the rows of the file in it, and which of the groups' rows they are."""
+    groups = _groups(path, region, size)
+    axes = _keys(path.parent, groups)[:3]
+    inside = (
+        (low <= (a + 0.5) * size) & ((a + 0.5) * size < high) for a, (low, high) in zip(axes, region.T, strict=True)
+    )
+    chosen = np.logical_and.reduce(list(inside))
+    with pq.ParquetFile(path) as file:
+        lengths = [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)]
+    first = np.cumsum([0, *lengths])
+    rows = np.concatenate([np.arange(first[g], first[g + 1]) for g in groups] or [first[:0]])
+    return groups, rows[chosen], chosen
 
 
 def _groups(path: Path, region: Float[np.ndarray, "2 3"], size: float) -> list[int]:
@@ -301,6 +337,9 @@ def _reader(folder: Path, dim: int, groups: list[int] | None, inside: np.ndarray
         return values if inside is None else values[inside]
 
     def read(name: str) -> np.ndarray:
+        if name == "packed":
+            packed = _keys(folder, groups)[3]
+            return packed if inside is None else packed[inside]
         if name == "features":
             row = plain("feature")
             vectors = _features(folder, dim)

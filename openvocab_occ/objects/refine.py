@@ -1,7 +1,7 @@
 """Batch refinement: what only the whole drive can tell. Each step can be switched off and says what it did."""
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 
@@ -58,7 +58,7 @@ def refine(
     tracks: Mapping[int, Track],
     *,
     together: Mapping[Pair, int],
-    apart: Set[Pair],
+    apart: Mapping[Pair, int],
     names: Sequence[str],
     config: RefineConfig | None = None,
 ) -> tuple[list[Track], Refinement, dict[int, int]]:
@@ -69,7 +69,8 @@ def refine(
     Args:
         tracks: By id.
         together: In how many frames one segment covered two tracks.
-        apart: Tracks that one frame showed as two things; such things that can move are never merged.
+        apart: In how many frames two tracks were two segments; things that can move are not merged where that was as
+            often as one segment covered both.
         names: Of the classes that tracks count votes for.
         config: Which steps are taken.
     """
@@ -95,12 +96,18 @@ def class_of(track: Track, names: Sequence[str]) -> str:
 
 
 def _merge(
-    kept: dict[int, Track], together: Mapping[Pair, int], apart: Set[Pair], names: Sequence[str], config: RefineConfig
+    kept: dict[int, Track],
+    together: Mapping[Pair, int],
+    apart: Mapping[Pair, int],
+    names: Sequence[str],
+    config: RefineConfig,
 ) -> dict[int, int]:
     """Merge pairs that segments covered together, those most often so first; the lower id stays."""
     into: dict[int, int] = {}
     barred: defaultdict[int, set[int]] = defaultdict(set)
-    for a, b in apart:
+    for (a, b), frames in apart.items():
+        if frames < together.get((a, b), 0):
+            continue
         barred[a].add(b)
         barred[b].add(a)
 
@@ -122,8 +129,9 @@ def _merge(
         one.absorb(two)
         del kept[b]
         into[b] = a
-        barred[a] |= barred[b]
-        for other in barred[b]:
+        others = barred.pop(b, set()) - {a, b}  # what stands may merge with what it was seen apart from
+        barred[a] = (barred[a] - {b}) | others
+        for other in others:
             barred[other].add(a)
     return {id: home(id) for id in into}
 
@@ -201,7 +209,10 @@ def _split(kept: dict[int, Track], names: Sequence[str]) -> int:
         track = kept[id]
         if track.moved or track.last is None:
             continue
-        pieces = cut_bridge(track.voxels, class_of(track, names), track.voxel_size)
+        seen = track.voxels  # a thing is judged by its hidden side too
+        whole = np.union1d(seen, track.body)
+        pieces = [np.intersect1d(p, seen) for p in cut_bridge(whole, class_of(track, names), track.voxel_size)]
+        pieces = [piece for piece in pieces if len(piece)]
         pieces.sort(key=len, reverse=True)
         for number, piece in enumerate(pieces if len(pieces) > 1 else []):
             part = track.of_voxels(piece, id if number == 0 else fresh)

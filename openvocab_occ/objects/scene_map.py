@@ -117,7 +117,7 @@ class SceneMap:
         """Read a `.ovmap` folder; columns and features of the voxels when they are first asked for.
 
         With a `region` (lower and upper corner, metres) only the voxels whose centres it holds; objects of which it
-        holds none are left out. Every file is checked against the manifest's sha256; those above 256 MB page by page
+        holds none are left out. Every file is checked against the manifest's sha256; those above 16 MB page by page
         as they are read.
 
         Raises NotFoundError where there is no folder, MapError where it is damaged, from the future, or no map.

@@ -13,6 +13,7 @@ from jaxtyping import Float32, Float64, Int64
 
 from openvocab_occ._jit import in_slices
 from openvocab_occ.errors import ConfigError
+from openvocab_occ.geometry import invert, transform
 from openvocab_occ.mapping import NO_LABEL
 from openvocab_occ.mapping.keys import pack, unpack
 from openvocab_occ.objects import _segments_kernels as kernels
@@ -23,6 +24,7 @@ from openvocab_occ.occupancy import OccupancyGrid
 _FORWARD = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)])[14:]
 _STEPS = (pack(_FORWARD.astype(np.int32)) - pack(np.zeros((1, 3), np.int32))).astype(np.int64)
 """Differences of packed keys of half of the 26 neighbours."""
+_TOLERANCE = 1e-6  # metres: centres on a face of the grid are of the voxel below, as in `cover_grid`
 MIN_PIXELS = 8
 """Fewer pixels of a view are no crop."""
 
@@ -35,12 +37,16 @@ class SegmentConfig:
     """The k of the segmentation: a component of n voxels bears edges k / n above its heaviest."""
     class_penalty: float = 0.5
     """Added to the distance of neighbours of which occupancy names different classes; 0 ignores classes."""
+    mask_penalty: float = 0.5
+    """Added to the distance of neighbours in different masks of one view, where a model puts out masks."""
     join: float = 0.75
     """Touching components of one class whose mean features are no further apart than this are one: a wall is one wall
     though its windows differ. Of things that can move any distance will do: cab and box are one truck."""
     gap: int = 3
     """Voxels along any axis between neighbours in an image that still touch: far surfaces are hit here and there only.
     Of things that can move one less, for those park close."""
+    unknown: int = 2
+    """Layers of voxels of which the grid knows nothing, between two of one class above one another that still touch."""
     reach: int = 24
     """Voxels between a hidden voxel and what is seen of its thing, at most."""
     cut: float = 0.9
@@ -51,7 +57,7 @@ class SegmentConfig:
     """Square metres from which a segment at most two voxels high is ground, where no class tells."""
 
     def __post_init__(self) -> None:
-        for name in ("scale", "class_penalty", "join", "cut", "flat_area"):
+        for name in ("scale", "class_penalty", "mask_penalty", "join", "cut", "flat_area"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise ConfigError(f"segment option {name} is not usable", expected=">= 0", got=getattr(self, name))
         if self.min_voxels < 1:
@@ -155,7 +161,10 @@ def _components(
     movable: np.ndarray,
 ) -> Int64[np.ndarray, " n"]:
     """Return each voxel's component, -1 for hidden ones that belong to nothing seen."""
-    pairs = np.concatenate([neighbour_pairs(packed), _image_pairs(packed, classes, row, frame, config, movable)])
+    pairs = np.concatenate([
+        neighbour_pairs(packed), _column_pairs(packed, classes, frame, config),
+        _image_pairs(packed, classes, row, frame, config, movable),
+    ])  # fmt: skip
     a, b = pairs.T
     named = (classes[a] != NO_LABEL) & (classes[b] != NO_LABEL)
     same = named & (classes[a] == classes[b])
@@ -163,7 +172,8 @@ def _components(
     # what is seen: by features, with classes as evidence
     place = np.cumsum(row >= 0) - 1
     edges = np.ascontiguousarray(row[pairs[shown]])
-    weights = _distances(frame, edges) + config.class_penalty * (named & ~same)[shown]
+    weights = _by_masks(_distances(frame, edges), frame, edges, config.mask_penalty)
+    weights = weights + config.class_penalty * (named & ~same)[shown]
     keep = weights <= config.cut
     edges, weights = np.ascontiguousarray(place[pairs[shown][keep]]), weights[keep]
     seen = np.empty(int((row >= 0).sum()), dtype=np.int64)
@@ -174,6 +184,31 @@ def _components(
     kernels.flood(pairs, same, config.reach, component)
     touching = same & (component[a] >= 0) & (component[b] >= 0) & (component[a] != component[b])
     return _joined(component, pairs[touching], classes, row, frame, config, movable)
+
+
+def _column_pairs(
+    packed: Int64[np.ndarray, " n"], classes: np.ndarray, frame: FrameVoxels, config: SegmentConfig
+) -> Int64[np.ndarray, "p 2"]:
+    """Return pairs of voxels of one class, one above the other, between which the grid knows nothing.
+
+    The beams of a LiDAR are further apart than voxels are high, so the voxels it tells of come in layers.
+    """
+    grid = frame.window
+    if grid is None or grid.known is None or not len(packed):
+        return np.empty((0, 2), dtype=np.int64)
+    found, T_grid_world = [], invert(grid.T_world_grid)
+    for gap in range(2, config.unknown + 2):
+        at = np.minimum(np.searchsorted(packed, packed + gap), len(packed) - 1)
+        low = np.flatnonzero((packed[at] == packed + gap) & (classes[at] == classes))
+        between = unpack(packed[low])[:, None] + np.arange(1, gap)[:, None] * np.array([0, 0, 1])
+        centers = transform(T_grid_world, (between.reshape(-1, 3) + 0.5) * frame.voxel_size)
+        index = grid.spec.index(centers - _TOLERANCE)
+        inside = grid.spec.contains(index)
+        blind = np.zeros(len(index), dtype=bool)
+        blind[inside] = ~grid.known[tuple(index[inside].T)]
+        low = low[blind.reshape(len(low), gap - 1).all(axis=1)]
+        found.append(np.stack([low, at[low]], axis=1))
+    return np.concatenate(found)
 
 
 def _image_pairs(
@@ -237,6 +272,18 @@ def _joined(
     held = component >= 0
     result[held] = part[np.searchsorted(numbers, component[held])]
     return result
+
+
+def _by_masks(
+    distance: Float32[np.ndarray, " e"], frame: FrameVoxels, edges: Int64[np.ndarray, "e 2"], penalty: float
+) -> Float32[np.ndarray, " e"]:
+    """Return distances that heed masks: none within one, more between two of one view."""
+    if frame.masks is None:
+        return distance
+    a, b = frame.masks[edges].T
+    both = (a >= 0) & (b >= 0)
+    distance = np.where(both & (a == b), np.float32(0), distance)
+    return (distance + np.float32(penalty) * (both & (a != b) & (a >> 16 == b >> 16))).astype(np.float32)
 
 
 def _distances(frame: FrameVoxels, edges: Int64[np.ndarray, "e 2"]) -> Float32[np.ndarray, " e"]:

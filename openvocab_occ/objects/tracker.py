@@ -32,12 +32,15 @@ class TrackConfig:
     """Weight of exp(-(d / s)^2 / 2), d the distance from the predicted place and s `motion_sigma`."""
     motion_sigma: float = 2.0
     """Metres."""
-    least: float = 0.9
+    least: float = 0.95
     """A pair that scores less is none: likeness alone (0.8) never makes one."""
     top_speed: float = 16.0
     """Metres a second: how far from its last place a thing of still unknown velocity is looked for."""
     occlusion: float = 4.0
     """Seconds for which a thing that moves is looked for while nothing shows it."""
+    stays: float = 0.3
+    """A thing not seen to move so far is looked for elsewhere only while less than this share of its coarse cells shows
+    anything: a piece of a parked car does not jump to the next one."""
     piece: float = 0.5
     """A segment left over joins a track that holds this share of its coarse cells, for something in front cut it."""
 
@@ -56,8 +59,8 @@ class Tracker:
         self.config = config or TrackConfig()
         self.names = tuple(names)
         self.tracks: dict[int, Track] = {}
-        self.apart: set[tuple[int, int]] = set()
-        """Pairs of tracks that one frame showed as two things."""
+        self.apart: Counter[tuple[int, int]] = Counter()
+        """Pairs of tracks, and in how many frames they were two segments."""
         self.together: Counter[tuple[int, int]] = Counter()
         """Pairs of tracks, and in how many frames one segment covered both."""
         self._voxel_size = voxel_size
@@ -108,7 +111,11 @@ class Tracker:
             self.tracks[into].absorb(gone)
             for cell in gone.cells:
                 self._cells[cell].add(into)
-        self.apart = {_ordered(*(into or 0 if i == id else i for i in pair)) for pair in self.apart}
+        for pair in [pair for pair in self.apart if id in pair]:
+            count = self.apart.pop(pair)
+            other = pair[0] if pair[1] == id else pair[1]
+            if into is not None and other != into:
+                self.apart[_ordered(into, other)] += count
 
     def _shared(self, cells: Sequence[int]) -> Counter[int]:
         """Return how many of the cells each track is known to hold."""
@@ -127,8 +134,12 @@ class Tracker:
 
         ids = [0] * len(segments)
         scores: dict[tuple[int, int], float] = {}
+        held: Counter[int] = Counter()  # cells of each track in which something is seen now
+        for counts in shared:
+            held.update(counts)
         for number, segment in enumerate(segments):
-            for id in {*shared[number], *self._near(segment, time)}:
+            gone = [id for id in self._near(segment, time) if not self._still_there(id, held[id])]
+            for id in {*shared[number], *gone}:
                 score = self._score(segment, cells[number], shared[number][id], self.tracks[id], time)
                 if score >= self.config.least:
                     scores[number, id] = score
@@ -167,6 +178,11 @@ class Tracker:
                 near.append(id)
         return near
 
+    def _still_there(self, id: int, held: int) -> bool:
+        """Tell whether a track that was never seen to move is, by what is seen now, where it was."""
+        track = self.tracks[id]
+        return not track.moved and held >= self.config.stays * len(track.cells)
+
     def _expected(self, track: Track, time: float) -> Float64[np.ndarray, " 2"]:
         assert track.last is not None
         return track.last.center[:2] + track.predicted(time)
@@ -190,7 +206,8 @@ class Tracker:
         sigma = config.motion_sigma
         if len(track.bounds) < 2:  # it may be anywhere within reach; the nearest is the likeliest
             sigma += config.top_speed * abs(time - track.last_time) / 3
-        return config.overlap * overlap + likeness + config.motion * float(np.exp(-0.5 * (off / sigma) ** 2))
+        alike = _ratio(segment, track.last) if not overlap else 1.0
+        return config.overlap * overlap + likeness + config.motion * alike * float(np.exp(-0.5 * (off / sigma) ** 2))
 
     def _may_move(self, votes: np.ndarray) -> bool:
         """True unless the class evidence speaks for a thing that stands."""
@@ -250,9 +267,16 @@ class Tracker:
             for other in shared[number]:
                 if other != id:
                     by_cell[other].add(id)
-        present = set(ids)
+        present, together = set(ids), set[tuple[int, int]]()
         for other, near in by_cell.items():
-            self.apart.update(_ordered(id, other) for id in near if other in present)
+            together.update(_ordered(id, other) for id in near if other in present)
+        self.apart.update(together)
+
+
+def _ratio(a: Segment, b: Segment) -> float:
+    """Return how near the sizes of two segments are, 1 for the same: what goes elsewhere keeps its size."""
+    small, large = sorted((len(a.body), len(b.body)))
+    return small / large
 
 
 def _ordered(a: int, b: int) -> tuple[int, int]:

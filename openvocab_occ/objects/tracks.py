@@ -126,6 +126,15 @@ class Track:
         return self._pieces[0]
 
     @property
+    def body(self) -> Int64[np.ndarray, " n"]:
+        """Packed keys, hidden ones included, that most of `bodies` hold; of a thing that moved those of the latest."""
+        bodies = self.bodies[-1:] if self.moved else self.bodies
+        if not bodies:
+            return np.empty(0, dtype=np.int64)
+        keys, counts = np.unique(np.concatenate(bodies), return_counts=True)
+        return keys[2 * counts > len(bodies)]
+
+    @property
     def feature(self) -> Float32[np.ndarray, " c"]:
         """Mean feature as a unit vector."""
         return (self.feature_sum / max(float(np.linalg.norm(self.feature_sum)), 1e-12)).astype(np.float32)

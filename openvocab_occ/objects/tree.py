@@ -1,6 +1,6 @@
 """Objects, and the tree they stand in: the scene at its root, objects below it."""
 
-from collections.abc import Iterable, Iterator, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -24,6 +24,8 @@ class Sighting(NamedTuple):
     """Name of the view."""
     box: tuple[int, int, int, int]
     """Left, top, right, bottom pixel, all inclusive."""
+    score: float = 0.0
+    """How good a picture of it this is, to compare sightings of one object by; 0 where that was not recorded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,17 +88,22 @@ class ObjectTree:
     """All nodes by id. Its length and its iteration are of the objects; the root is `tree[0]`."""
 
     def __init__(self, nodes: Iterable[SceneObject]) -> None:
-        nodes = tuple(nodes)
-        self._nodes = {node.id: node for node in nodes}
-        if len(self._nodes) != len(nodes):
-            raise DataError("object ids repeat", got=sorted(node.id for node in nodes))
-        if 0 not in self._nodes or self._nodes[0].level != SCENE:
-            raise DataError("object tree has no root", expected="node 0 of level 'scene'", got=sorted(self._nodes)[:5])
-        for node in nodes:
-            if (node.parent is None) != (node.id == 0) or (node.parent is not None and node.parent not in self._nodes):
-                raise DataError(f"object {node.id} hangs nowhere", expected="a parent in the tree", got=node.parent)
-            if any(child not in self._nodes or self._nodes[child].parent != node.id for child in node.children):
-                raise DataError(f"children of object {node.id} do not name it as parent", got=node.children)
+        self._known: dict[int, SceneObject] | None = _by_id(tuple(nodes))
+        self._load: Callable[[], Sequence[SceneObject]] | None = None
+
+    @classmethod
+    def stored(cls, load: Callable[[], Sequence[SceneObject]]) -> "ObjectTree":
+        """Return a tree whose nodes are read when one is first asked for."""
+        tree = cls.__new__(cls)
+        tree._known, tree._load = None, load
+        return tree
+
+    @property
+    def _nodes(self) -> dict[int, SceneObject]:
+        if self._known is None:
+            assert self._load is not None, "a tree is made of nodes, or of what reads them"
+            self._known = _by_id(tuple(self._load()))
+        return self._known
 
     @property
     def root(self) -> SceneObject:
@@ -143,6 +150,21 @@ class ObjectTree:
 
     def __repr__(self) -> str:
         return f"ObjectTree({len(self)} objects)"
+
+
+def _by_id(nodes: Sequence[SceneObject]) -> dict[int, SceneObject]:
+    """Return nodes by id once they are known to be one tree."""
+    found = {node.id: node for node in nodes}
+    if len(found) != len(nodes):
+        raise DataError("object ids repeat", got=sorted(node.id for node in nodes))
+    if 0 not in found or found[0].level != SCENE:
+        raise DataError("object tree has no root", expected="node 0 of level 'scene'", got=sorted(found)[:5])
+    for node in nodes:
+        if (node.parent is None) != (node.id == 0) or (node.parent is not None and node.parent not in found):
+            raise DataError(f"object {node.id} hangs nowhere", expected="a parent in the tree", got=node.parent)
+        if any(child not in found or found[child].parent != node.id for child in node.children):
+            raise DataError(f"children of object {node.id} do not name it as parent", got=node.children)
+    return found
 
 
 def without(nodes: Sequence[SceneObject], gone: Set[int]) -> list[SceneObject]:

@@ -19,6 +19,7 @@ from openvocab_occ.mapping import (
     Cover,
     DynamicLayer,
     PixelWeights,
+    Segments,
     Sight,
     VoxelMap,
     cover_grid,
@@ -33,9 +34,10 @@ from openvocab_occ.mapping.layers import MOVABLE, layer_of, moving, standing
 from openvocab_occ.objects import EncoderInfo, KeyFrame, NamedCamera, Provenance, SceneMap
 from openvocab_occ.objects.builder import ObjectBuilder, ObjectConfig
 from openvocab_occ.objects.frame_voxels import gather
+from openvocab_occ.objects.sightings import with_sightings
 from openvocab_occ.occupancy import OCC3D_SPEC, OccupancyGrid
 from openvocab_occ.occupancy.lidar import grid_from_lidar
-from openvocab_occ.segmentation.encoder import FeatureMap, PixelEncoder
+from openvocab_occ.segmentation.encoder import FeatureMap, MaskMap, PixelEncoder
 
 GridFrom = Literal["auto", "occupancy", "lidar"]
 """Where a frame's grid comes from: its own occupancy, its LiDAR points, or (auto) the first of the two it has."""
@@ -107,6 +109,7 @@ class MapBuilder:
         weights: PixelWeights | None = None,
         objects: ObjectConfig | None = None,
         provenance: Provenance | None = None,
+        device: str | None = None,
     ) -> None:
         """Begin with an empty map.
 
@@ -118,6 +121,7 @@ class MapBuilder:
             weights: How much each pixel counts; None for the usual ones.
             objects: How voxels become objects; None for the usual way.
             provenance: What the map's file says about its source; options, date and version are filled in.
+            device: Where torch lifts and adds up features, such as `cuda`; None for the kernels on the CPU.
         """
         if not (np.isfinite(max_depth) and max_depth > 0):
             raise ConfigError("max_depth is not usable", expected="a distance above 0 m", got=max_depth)
@@ -135,6 +139,7 @@ class MapBuilder:
         self._grid_from: GridFrom = grid_from
         self._provenance = provenance or Provenance()
         self._weights = weights or PixelWeights()
+        self._device = device
         self._voxels: VoxelMap | None = None
         self._movable: VoxelMap | None = None  # voxels of classes that can move, until it is known whether they did
         self._layers: list[DynamicLayer] = []
@@ -158,12 +163,11 @@ class MapBuilder:
         voxel_size = self._size(grid)
         # depth: which voxel each pixel sees (Eq. 5-9)
         seen = [self._see(view, grid, voxel_size) for view in frame.views]
-        # features: cells of the images, added up over the pixels of each voxel
-        cells = self._encoder.encode([view.image for view in frame.views])
-        self._check(cells, frame)
+        # features: cells of the images, or masks with a vector each, added up over the pixels of each voxel
+        cells = self._encode(frame)
         lifted = join([
             lift(one.rows, len(one.labels), features, image=view.image,
-                 sight=Sight(view.camera, one.depth, self._weights), view=number)
+                 sight=Sight(view.camera, one.depth, self._weights), view=number, device=self._device)
             for number, (view, one, features) in enumerate(zip(frame.views, seen, cells, strict=True))
         ])  # fmt: skip
         check_finite(lifted.sums, f"features of frame {frame.index}")
@@ -172,7 +176,9 @@ class MapBuilder:
         voxels, movable = self._voxels, self._movable
         if voxels is None or movable is None:
             size, dim, contract = voxel_size, self._encoder.dim, self._encoder.contract
-            voxels, movable = (VoxelMap(size, dim, contract=contract, num_classes=len(names)) for _ in range(2))
+            voxels, movable = (
+                VoxelMap(size, dim, contract=contract, num_classes=len(names), device=self._device) for _ in range(2)
+            )
         self._look_through(voxels, frame, seen, grid)
         cover, labels = _stacked(seen)
         moves = np.isin(np.arange(256), [names.index(name) for name in MOVABLE if name in names])[labels]
@@ -213,7 +219,8 @@ class MapBuilder:
         encoder = EncoderInfo.of(self._encoder)
         voxels, dynamic = self._settled(self._voxels, self._movable)
         assert self._objects is not None, "integrate makes it with the first frame"
-        objects = self._objects.tree(voxels, [frame.T_world_ego for frame in self._frames])
+        tree = self._objects.tree(voxels, [frame.T_world_ego for frame in self._frames])
+        objects = with_sightings(tree, voxels, self._frames)
         options = {"voxel_size": voxels.voxel_size, "max_depth": self._max_depth, "grid_from": self._grid_from,
                    "weights": asdict(self._weights)}  # fmt: skip
         provenance = replace(
@@ -277,13 +284,23 @@ class MapBuilder:
         rows, flat = rows_from_grid(image, grid)
         return _Seen(rows, cover_grid(flat, grid, voxel_size), grid.labels.reshape(-1)[flat], image.depth)
 
-    def _check(self, cells: Sequence[FeatureMap], frame: Frame) -> None:
-        if len(cells) != len(frame.views):
-            raise ModelError(
-                f"encoder {self._encoder.name} lost images", expected=f"{len(frame.views)} outputs", got=len(cells)
-            )
-        for features in cells:
-            check_shape(features.cells, (None, None, self._encoder.dim), f"output of encoder {self._encoder.name}")
+    def _encode(self, frame: Frame) -> list[FeatureMap] | list[Segments]:
+        """Return the cells of each view, or its masks where the encoder puts out such."""
+        encoder, images = self._encoder, [view.image for view in frame.views]
+        masked = getattr(encoder, "has_masks", False)
+        found: list[FeatureMap] | list[MaskMap] = encoder.encode_masks(images) if masked else encoder.encode(images)  # pyright: ignore[reportAttributeAccessIssue, reportUnknownMemberType]
+        if len(found) != len(images):
+            raise ModelError(f"encoder {encoder.name} lost images", expected=f"{len(images)} outputs", got=len(found))
+        cells: list[FeatureMap] = []
+        segments: list[Segments] = []
+        for one, image in zip(found, images, strict=True):
+            if isinstance(one, MaskMap):
+                check_shape(one.embeddings, (None, encoder.dim), f"vectors of encoder {encoder.name}")
+                segments.append(Segments.of(one, *image.shape[:2]))
+            else:
+                check_shape(one.cells, (None, None, encoder.dim), f"output of encoder {encoder.name}")
+                cells.append(one)
+        return segments or cells
 
 
 def grid_of(frame: Frame, grid_from: GridFrom = "auto") -> OccupancyGrid:

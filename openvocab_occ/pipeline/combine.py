@@ -11,6 +11,7 @@ from openvocab_occ.errors import ConfigError, DataError, EncoderMismatchError
 from openvocab_occ.geometry import transform
 from openvocab_occ.mapping import DynamicLayer, VoxelMap, keys_of
 from openvocab_occ.objects import KeyFrame, NamedCamera, ObjectTree, Provenance, SceneMap, SceneObject, group_objects
+from openvocab_occ.objects.sightings import with_sightings
 from openvocab_occ.objects.tree import without
 from openvocab_occ.pipeline.compare import diff
 
@@ -124,7 +125,8 @@ def merge(a: SceneMap, b: SceneMap, *, align: bool = False) -> Merged:
     voxels = voxels.subset(voxels.log_odds >= 0)
     frames = (*a.frames, *(_moved_frame(frame, T, shift) for frame in b.frames))
     layers = (*a.dynamic, *(_moved_layer(layer, T, shift, voxels.voxel_size) for layer in b.dynamic))
-    objects = group_objects(voxels, labels=a.encoder.labels, class_names=a.class_names)
+    grouped = group_objects(voxels, labels=a.encoder.labels, class_names=a.class_names)
+    objects = with_sightings(grouped, voxels, frames)
     made = _provenance((a, b), "merge")
     scene = SceneMap(voxels, objects, a.encoder, frames, made, a.class_names, layers)
     return Merged(scene, alignment, int(gone[0].sum() + gone[1].sum()))

@@ -64,8 +64,9 @@ class TextEncoder(Protocol):
 class PixelEncoder(Protocol):
     """Images to cells.
 
-    Two attributes are optional: `scoring`, a segmentation.scoring.Scoring that turns cosines into scores, and
-    `encode_masks(images) -> list[MaskMap]` of models that put out masks.
+    Three attributes are optional: `scoring`, a segmentation.scoring.Scoring that turns cosines into scores; and of
+    models that put out masks `has_masks`, which is then true, and `encode_masks(images) -> list[MaskMap]`, which a map
+    then asks for in place of cells.
     """
 
     name: str

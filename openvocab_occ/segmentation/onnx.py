@@ -131,6 +131,11 @@ class OnnxEncoder:
             return [self._in_tiles(place(image, self.card.input)) for image in images]
         return [found for part in self._batches(images) for found in self._encode_same_size(part)]
 
+    @property
+    def has_masks(self) -> bool:
+        """Whether `encode_masks` has an answer: for a `masks` model, and for crops of given masks."""
+        return self.card.contract == "masks" or (self._proposals is not None and self._proposals.given)
+
     def encode_masks(self, images: Sequence[UInt8[np.ndarray, "_ _ 3"]]) -> list[MaskMap]:
         """Return masks and one vector each, of a `masks` model or of crops around given masks; else ModelError."""
         if self.card.contract == "masks":
@@ -140,7 +145,7 @@ class OnnxEncoder:
                 for part, results in runs
                 for placed, found in zip(part, results, strict=True)
             ]
-        if self._proposals is None or not self._proposals.given:
+        if not self.has_masks or self._proposals is None:
             raise ModelError(f"model {self.name} puts out no masks", expected="contract masks, or crops of given masks")
         card = self.card.crops or CropCard()
         found = zip(images, self._proposals(images), strict=True)

@@ -118,6 +118,15 @@ def test_smooth_surfaces_are_nearer_to_meshes_than_voxels():
     assert all(error.misses < 0.05 for error in errors.values())
 
 
+def test_smooth_labels_are_nearer_to_the_city_than_voxels():
+    from openvocab_occ.evaluation.mesh_scenes import city_errors
+
+    errors = {e.surface: e for e in city_errors(3, keyframes=(20,))}
+    assert errors["smooth labels"].median_m < 0.75 * errors["voxel"].median_m
+    assert errors["smooth labels"].p90_m < 0.75 * errors["voxel"].p90_m
+    assert max(errors[name].misses for name in ("voxel", "smooth labels")) < 0.08
+
+
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("options", "message"),

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -5,6 +7,7 @@ from hypothesis import strategies as st
 
 from openvocab_occ.errors import ConfigError, DataError
 from openvocab_occ.evaluation.grounding import calibration_of, judge, summarize
+from openvocab_occ.evaluation.grounding_drive import Drive, judge_drive, questions_of
 from openvocab_occ.evaluation.grounding_metrics import (
     auc_top_k,
     average_precision,
@@ -17,6 +20,9 @@ from openvocab_occ.evaluation.grounding_metrics import (
 from openvocab_occ.evaluation.grounding_protocols import PRESETS, LabelledScene, evaluate_segmentation
 from openvocab_occ.evaluation.grounding_queries import ABSENT, CATEGORIES, questions_about
 from openvocab_occ.evaluation.grounding_truth import TrueThing, Truth, scene_of_truth
+from openvocab_occ.evaluation.words import CLASSES
+from openvocab_occ.mapping import keys_of
+from openvocab_occ.mapping.keys import pack
 from openvocab_occ.objects import Box
 from openvocab_occ.query.relations import Viewpoint
 
@@ -124,6 +130,42 @@ def test_a_map_of_the_truth_answers_everything(truth):
         assert set(score.accuracy.values()) == {1.0}, name
         assert (score.count_exact, score.false_found) == (1.0, 0.0), name
     assert calibration_of(outcomes) is None
+
+
+def driven(truth, scene, least=10):
+    """A drive that saw the truth with a flawless mapper."""
+    sets = {node.id: np.unique(pack(keys_of(node.points, scene.voxels.voxel_size))) for node in scene.objects}
+    sure = frozenset(id for id, keys in sets.items() if len(keys) >= least)
+    return Drive(scene=scene, truth=truth, sets=sets, sure=sure, watched=frozenset(sets) - {3})
+
+
+def test_a_drive_that_saw_the_truth_answers_everything(truth):
+    drive = driven(truth, scene_of_truth(truth, also=(*ABSENT, *CLASSES)))
+    assert 6 not in drive.sure  # the pedestrian is too small to be asked for
+    words = {"automobile": "car", "sedan": "car", "barriers": "barrier", "pedestrians": "pedestrian"}
+    questions = questions_of(drive, 0, synonyms=words)
+    for question in questions:
+        assert question.wanted <= drive.sure
+        assert not question.wanted & question.either
+    texts = {q.text: q for q in questions}
+    assert texts["automobile"].wanted == {1, 2, 3}
+    assert texts["barriers"].verdict == texts["buses"].verdict == "absent"
+    assert texts["parked cars"].either == {3}  # it was not watched for long enough
+    assert "pedestrians" not in texts
+    outcomes = judge_drive(drive, None, 0, synonyms=words)
+    assert [o.question.text for o in outcomes if not o.right] == []
+    scores = summarize(outcomes)
+    assert all(score.accuracy["0.5"] == score.mean_precision == score.count_exact == 1 for score in scores.values())
+    assert {"class", "synonym", "state", "relation", "absent", "unobserved"} <= set(scores)
+
+
+def test_a_drive_of_something_else_does_not(truth):
+    """Objects that are not where the true things are."""
+    drive = driven(truth, scene_of_truth(truth, also=(*ABSENT, *CLASSES)))
+    away = {id: drive.sets[1 + id % 6] for id in drive.sets}
+    outcomes = judge_drive(replace(drive, sets=away), None, 0)
+    assert summarize(outcomes)["class"].accuracy["0.25"] < 0.5
+    assert [o for o in outcomes if o.question.category == "relation"] == []  # their nouns are not found
 
 
 def test_a_map_of_something_else_does_not(truth):

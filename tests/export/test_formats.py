@@ -88,6 +88,13 @@ def test_openlex3d_and_rerun(saved, street, tmp_path):
         assert (cloud.columns["object"][node.voxels] == row).all()
     pytest.importorskip("rerun")
     assert convert(saved, tmp_path / "street.rrd").read_bytes()[:4] == b"RRF2"
+    pytest.importorskip("rerun.chunk")
+    back = read_cloud(tmp_path / "street.rrd")
+    np.testing.assert_allclose(back.points, street.voxels.centers, atol=1e-4)
+    np.testing.assert_array_equal(back.colors, street.voxels.colors)
+    (tmp_path / "bad.rrd").write_bytes(b"no recording")
+    with pytest.raises(DataError, match=r"bad\.rrd cannot be read: expected a Rerun recording"):
+        read_cloud(tmp_path / "bad.rrd")
 
 
 def test_files_that_are_not_what_they_say_are_told(tmp_path, saved, monkeypatch):

@@ -117,6 +117,18 @@ def test_bayes_is_bounded_so_that_it_can_forget(city, tmp_path):
     assert (city.read(T, SPEC).logits.argmax(-1) == 3).all()
 
 
+def test_bayes_forgets_also_where_the_runner_up_is_the_same(city, tmp_path):
+    """Free is second while the fence stands, the fence is second afterwards: each look says 1, the bound is 8."""
+    T = np.eye(4)
+    for n in range(30):
+        logits = np.zeros((*SPEC.shape, 4), np.float32)
+        logits[..., 1], logits[..., 3] = (4.0, 3.0) if n < 20 else (3.0, 4.0)
+        write(city, logits, ALL, T, stamp=float(n))
+    for looks, label in ((6, 1), (10, 3)):
+        rebuild(city, out=tmp_path / str(looks), until=19.0 + looks, policy="bayes")
+        assert (TileMap.open(tmp_path / str(looks)).read(T, SPEC).logits.argmax(-1) == label).all()
+
+
 def test_diff_tells_what_appeared_vanished_and_changed(city, tmp_path):
     labels = np.full(SPEC.shape, 3)
     labels[5:8] = 1

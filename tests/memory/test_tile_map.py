@@ -349,7 +349,7 @@ def test_locate_agrees_with_its_reference(seed):
 def test_transposed_is_the_transpose(rng, shape):
     source = rng.integers(0, 256, shape, dtype=np.uint8)
     out = np.empty(shape[::-1], np.uint8)
-    transposed(source, out.view("<u8"))
+    transposed(source.view("<u8"), out.view("<u8"))
     assert (out == source.T).all()
 
 

@@ -107,10 +107,13 @@ def test_pictures_hold_no_pair_that_is_kept_out(lexicon, script):
     def pairs(drive):
         return {(t.kind, t.color) for t in [*drive.still, *(m.thing for m in drive.movers)]}
 
-    drive = City(1000).traversal(route=1, condition="heavy traffic")
-    assert pairs(drive) & banned
-    scenes.repaint(drive, lexicon)
-    assert not pairs(drive) & banned
+    for seed in (1000, scenes.ENRICHED[0]):
+        drive = City(seed).traversal(route=1, condition="heavy traffic")
+        assert pairs(drive) & banned
+        before = {kind for kind, _ in pairs(drive)}
+        scenes.repaint(drive, lexicon, seed)
+        assert not pairs(drive) & banned
+        assert (len({kind for kind, _ in pairs(drive)} - before) > 0) == (seed in scenes.ENRICHED)
 
 
 @settings(max_examples=50)

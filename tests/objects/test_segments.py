@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from block_frames import NAMES, block, frame_of, vector
@@ -5,10 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openvocab_occ.errors import ConfigError
+from openvocab_occ.geometry import GridSpec
 from openvocab_occ.mapping.keys import pack
 from openvocab_occ.objects import _segments_kernels as kernels
 from openvocab_occ.objects import _segments_reference as reference
 from openvocab_occ.objects.segments import SegmentConfig, neighbour_pairs, segment_frame
+from openvocab_occ.occupancy import OccupancyGrid
 
 
 @settings(max_examples=60)
@@ -51,6 +55,19 @@ def test_things_apart_are_segments_and_ground_is_none():
     np.testing.assert_allclose(truck.high, [6.4, 6.4, 3.2])
     np.testing.assert_allclose(truck.feature, vector("truck"), atol=1e-5)
     assert truck.weight == 9 * 768
+
+
+@pytest.mark.parametrize(("gap", "blind", "count"), [(1, True, 1), (2, True, 1), (3, True, 2), (1, False, 2)])
+def test_layers_that_a_lidar_tells_of_are_one_thing(gap, blind, count):
+    """A wall known in two bands: what is unknown between them may be wall, what is known to be free is not."""
+    bands = [block("manmade", (0, 0, 0), (6, 1, 3)), block("manmade", (0, 0, 3 + gap), (6, 1, 3))]
+    known = np.ones((12, 12, 16), bool)
+    known[:, :, 7 : 7 + gap] = not blind
+    labels = np.full(known.shape, NAMES.index("free"), np.uint8)
+    spec = GridSpec((-1.6, -1.6, -1.8), 0.4, known.shape)  # half a voxel off the lattice, as Occ3D's
+    grid = OccupancyGrid(labels, spec, np.eye(4), NAMES.index("free"), known=known, class_names=NAMES)
+    frame = replace(frame_of(bands), window=grid)
+    assert len(segment_frame(frame, NAMES)) == count
 
 
 def test_an_empty_street_has_no_segments():

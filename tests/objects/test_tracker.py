@@ -3,9 +3,15 @@
 import numpy as np
 import pytest
 from block_frames import NAMES, SIZE, block, frame_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.sparse.csgraph import connected_components
 
 from openvocab_occ.errors import ConfigError, DataError
+from openvocab_occ.mapping import FreeSpace, Lifted, VoxelMap
+from openvocab_occ.mapping.keys import pack, unpack
 from openvocab_occ.objects.bridges import cut_bridge
+from openvocab_occ.objects.describe import motion_of
 from openvocab_occ.objects.refine import RefineConfig, refine
 from openvocab_occ.objects.segments import segment_frame
 from openvocab_occ.objects.state import judge
@@ -77,7 +83,7 @@ def test_what_starts_to_stand_is_stopped():
 def test_an_empty_street_has_no_tracks():
     tracker, ids = follow([[], [], []])
     assert ids == [[], [], []]
-    assert refine(tracker.tracks, together={}, apart=set(), names=NAMES)[0] == []
+    assert refine(tracker.tracks, together={}, apart={}, names=NAMES)[0] == []
 
 
 def test_two_trucks_bumper_to_bumper_are_cut_at_the_neck():
@@ -92,13 +98,11 @@ def test_two_trucks_bumper_to_bumper_are_cut_at_the_neck():
     lengths = sorted(len(t.voxels) for t in tracks)
     assert lengths[0] / lengths[1] > 0.75
     assert sum(lengths) == len(tracker.tracks[1].voxels)
-    whole, off, _ = refine(tracker.tracks, together={}, apart=set(), names=NAMES, config=RefineConfig(split=False))
+    whole, off, _ = refine(tracker.tracks, together={}, apart={}, names=NAMES, config=RefineConfig(split=False))
     assert (len(whole), off.split) == (1, 0)
 
 
 def test_a_lone_truck_is_not_cut():
-    from openvocab_occ.mapping.keys import pack
-
     keys = np.concatenate([block("truck", (0, 0, 0), (4, 6, 6))[0], block("truck", (4, 0, 0), (1, 6, 2))[0],
                            block("truck", (5, 0, 0), (13, 6, 8))[0]]).astype(np.int32)  # fmt: skip
     packed = np.sort(pack(keys))
@@ -119,11 +123,74 @@ def test_pieces_of_one_thing_merge_and_two_things_do_not():
     assert len(tracker.tracks) == 4  # the tracks themselves stay
 
 
+def test_a_piece_of_a_parked_car_does_not_jump_to_the_next_one():
+    """Cars in a row, shown bit by bit through what drives by: now the rear of one, now the rear of another."""
+    rear = [block("car", (x, 0, 1), (2, 5, 2), "car") for x in (0, 16, 32)]
+    whole = [car(x, 0, "car") for x in (0, 16, 32)]
+    frames = [[whole[0], rear[1]], [whole[0], whole[1], rear[2]], [rear[0], whole[1], whole[2]], whole, whole]
+    tracker, ids = follow(frames)
+    assert len(tracker.tracks) == 3
+    assert [sorted(found) for found in ids[1:]] == [[1, 2, 3]] * 4
+    assert states(tracker) == ["parked"] * 3
+
+
+def test_two_segments_now_and_then_do_not_keep_a_thing_in_two():
+    """An excavator is once seen as cab and boom, and later as one."""
+    cab, boom = block("truck", (0, 0, 0), (8, 6, 7)), block("truck", (11, 2, 5), (6, 2, 2))
+    link = block("truck", (8, 2, 5), (3, 2, 2), "truck")
+    tracker, _ = follow([[cab, boom]] + [[cab, link, boom]] * 5)
+    tracks, _, _ = refine(tracker.tracks, together=tracker.together, apart=tracker.apart, names=NAMES)
+    assert len(tracks) == 1
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**32 - 1))
+def test_merging_is_the_same_whatever_was_seen_apart(seed):
+    """Pieces of a wall that stands merge along `together`, be they apart in other frames or not."""
+    rng = np.random.default_rng(seed)
+    walls = [block("manmade", (9 * n, 0, 0), (3, 1, 3)) for n in range(6)]
+    tracker, _ = follow([walls] * 2)
+    pairs = [tuple(sorted(p)) for p in (rng.integers(1, 7, size=(8, 2))).tolist() if p[0] != p[1]]
+    apart = dict.fromkeys([tuple(sorted(p)) for p in rng.integers(1, 7, size=(9, 2)).tolist() if p[0] != p[1]], 9)
+    together = dict.fromkeys(pairs, 2)
+    graph = np.zeros((7, 7), bool)
+    for a, b in together:
+        graph[a, b] = True
+    count = connected_components(graph, directed=False)[0] - 1  # id 0 is none
+    assert len(refine(tracker.tracks, together=together, apart=apart, names=NAMES)[0]) == count
+
+
+def test_what_may_be_one_thing_is_cut_at_a_clear_gap_only():
+    def cut(*blocks):
+        return len(cut_bridge(np.sort(pack(np.concatenate(blocks).astype(np.int32))), "truck", SIZE))
+
+    cab, box = block("truck", (0, 0, 0), (12, 6, 6))[0], block("truck", (14, 0, 0), (14, 6, 8))[0]
+    assert cut(cab, block("truck", (12, 0, 0), (2, 6, 2))[0], box) == 1  # 11 m: a lorry with a neck
+    assert cut(cab, block("truck", (12, 3, 0), (2, 1, 1))[0], box) == 2  # a stray voxel between two
+    far = block("truck", (32, 0, 0), (14, 6, 8))[0]
+    assert cut(box, block("truck", (28, 0, 0), (4, 6, 2))[0], far) == 2  # 13 m: too long for one
+
+
+def test_a_rim_that_was_once_seen_through_is_not_left():
+    tracker, _ = follow([[car(0)], [car(3)]])
+    voxels = VoxelMap(SIZE, 16)
+    packed = np.union1d(tracker.tracks[1].first.seen, tracker.tracks[1].last.seen)
+    keys = unpack(packed)
+    one = np.ones(len(keys), np.float32)
+    lifted = Lifted(np.ones((len(keys), 16), np.float32), one, one.astype(np.int32))
+    blocks = np.unique(keys // 8, axis=0).astype(np.int32)
+    voxels.free = FreeSpace.from_blocks(SIZE, blocks, np.ones((len(blocks), 512), np.uint8))
+    assert motion_of(tracker.tracks[1], voxels).left == 1.0
+    for n in range(5):
+        voxels.integrate(keys, lifted, time=float(n))
+    assert motion_of(tracker.tracks[1], voxels).left == 0.0
+
+
 def test_noise_is_dropped_when_asked():
     tracker, _ = follow([[block("car", (0, 0, 0), (2, 1, 1)), car(20)], [car(20)]])
-    kept, done, _ = refine(tracker.tracks, together={}, apart=set(), names=NAMES)
+    kept, done, _ = refine(tracker.tracks, together={}, apart={}, names=NAMES)
     assert (len(kept), done.dropped) == (1, 1)
-    kept, done, _ = refine(tracker.tracks, together={}, apart=set(), names=NAMES, config=RefineConfig(drop=False))
+    kept, done, _ = refine(tracker.tracks, together={}, apart={}, names=NAMES, config=RefineConfig(drop=False))
     assert (len(kept), done.dropped) == (2, 0)
 
 

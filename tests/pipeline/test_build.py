@@ -7,6 +7,7 @@ from openvocab_occ.errors import ConfigError, DataError, ModelError, ShapeError
 from openvocab_occ.geometry import Camera, GridSpec, look_at, pose, transform
 from openvocab_occ.mapping import PixelWeights
 from openvocab_occ.objects import SceneMap
+from openvocab_occ.objects.sightings import best_sightings
 from openvocab_occ.occupancy import OccupancyGrid
 from openvocab_occ.pipeline import MapBuilder, build_map
 from openvocab_occ.query.find import find
@@ -93,6 +94,33 @@ def test_the_map_answers_and_remembers_its_frames(tmp_path):
     assert [camera.name for camera in opened.frames[0].cameras] == ["FRONT"]
     assert (opened.provenance.name, opened.provenance.synthetic) == ("wall", False)
     assert opened.provenance.options["voxel_size"] == 0.5
+
+
+def test_everything_knows_its_best_views(tmp_path):
+    scene = build_map(sequence(wall_frame(0), wall_frame(1)), ByColor())
+    opened = SceneMap.open(scene.save(tmp_path / "wall.ovmap"))
+    held = [node for node in scene.objects.nodes if len(node.voxels)]
+    assert held
+    for node in held:
+        assert {view.view for view in node.views} == {"FRONT"}
+        assert [view.score for view in node.views] == sorted((view.score for view in node.views), reverse=True)
+        assert opened.objects[node.id].views == node.views
+        pixels, _ = wall_camera().project(scene.voxels.centers[node.voxels])
+        for view in node.views:
+            low, high = np.array(view.box[:2]), np.array(view.box[2:])
+            assert ((pixels > low - 6) & (pixels < high + 6)).all()  # a voxel of 0.5 m is 5 pixels wide there
+
+
+def test_views_of_voxels_are_those_that_weigh_most():
+    scene = build_map(sequence(wall_frame(0), wall_frame(1)), ByColor())
+    members = np.arange(len(scene.voxels))
+    frames = {frame.index: frame for frame in scene.frames}
+    (best,) = best_sightings(scene.voxels, members, frames)  # of two equal views the first counts
+    assert (best.frame, best.view) == (0, "FRONT")
+    assert best.score == pytest.approx(scene.voxels.best_views(members)[3].sum(), rel=1e-5)
+    boxes = scene.voxels.best_views(members)[2]
+    assert best.box == (*boxes[:, :2].min(axis=0), *boxes[:, 2:].max(axis=0))
+    assert best_sightings(scene.voxels, members, {}) == ()
 
 
 def test_measured_depth_puts_the_wall_where_the_grid_has_it():

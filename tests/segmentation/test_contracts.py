@@ -1,6 +1,7 @@
 """Tokens, masks, crops, tiles and feature files: each law against a second way to the same numbers."""
 
 import json
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -9,7 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
+from openvocab_occ.datasets.frame import Frame, View
 from openvocab_occ.errors import CardError, DataError, ModelError, NotFoundError, UnsafeFileError
+from openvocab_occ.geometry import Camera, GridSpec, look_at
+from openvocab_occ.mapping import PixelWeights, Segments, lift
+from openvocab_occ.occupancy import OccupancyGrid
+from openvocab_occ.pipeline import MapBuilder, build_map
 from openvocab_occ.segmentation import FeatureMap, MaskMap, PixelEncoder
 from openvocab_occ.segmentation.card import CropCard, InputCard, Tile
 from openvocab_occ.segmentation.crops import windows
@@ -343,3 +349,50 @@ def test_bad_feature_files(computed, tmp_path):
         card = json.loads((folder / "c.card.yaml").read_text())
         (folder / "c.card.yaml").write_text(json.dumps({k: v for k, v in card.items() if k != "text"}))
         load_encoder(folder / "c.card.yaml")
+
+
+def wall_of_halves():
+    """A wall of one class 6 m ahead, painted red on its right half."""
+    labels = np.full((16, 16, 16), 17, np.uint8)
+    labels[12] = 15
+    grid = OccupancyGrid(labels, GridSpec((0.0, -4.0, -4.0), 0.5, labels.shape), np.eye(4))
+    camera = Camera(np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]]), 64, 48,
+                    look_at(np.array([0.2, 0.0, 0.0]), np.array([6.0, 0.0, 0.0])))  # fmt: skip
+    image = np.zeros((48, 64, 3), np.uint8)
+    image[:, 32:, 0] = 250
+    return Frame(0, 0.0, np.eye(4), (View(image, camera, name="FRONT"),), grid), image
+
+
+def test_masks_reach_the_map_as_masks(load, tiny, tmp_path, monkeypatch):
+    encoder = load(halves(tmp_path / "m.onnx", tiny), "masks", MASKS, input__range=[0, 1])
+    frame, image = wall_of_halves()
+    (masks,) = encoder.encode_masks([image])
+    dense = SimpleNamespace(
+        name="dense", contract="dense", dim=3, labels=(), fingerprint="f" * 64, text=None,
+        encode=lambda images: [masks.densify() for _ in images],
+    )  # fmt: skip
+    wanted = build_map([frame], dense, weights=PixelWeights.none())
+    calls = []
+    monkeypatch.setattr(encoder, "encode", lambda images: calls.append("cells"))
+    monkeypatch.setattr(encoder, "encode_masks", lambda images: calls.append("masks") or [masks for _ in images])
+    builder = MapBuilder(encoder, weights=PixelWeights.none())
+    builder.integrate(frame)
+    found = builder.snapshot()
+    assert calls == ["masks"]  # once a frame, and never a vector a cell
+    np.testing.assert_array_equal(found.voxels.keys, wanted.voxels.keys)
+    np.testing.assert_allclose(found.voxels.features, wanted.voxels.features, atol=1e-5)
+    right = found.voxels.centers[:, 1] < 0
+    np.testing.assert_allclose(found.voxels.features[right & (found.voxels.centers[:, 1] < -0.5)][:, 0], 1, atol=1e-6)
+    # one wall of one class is two segments, for the masks are two
+    assert len(builder.objects.latest.segments) == 2
+
+
+def test_pixels_without_a_mask_are_seen_all_the_same():
+    ids = np.full((48, 64), -1, np.int32)
+    ids[:, 32:] = 0
+    found = MaskMap(ids, np.array([[1.0, 0, 0]], np.float32), np.ones(1, np.float32), (1.0, 1.0), (0.0, 0.0))
+    rows = np.repeat(np.arange(3, dtype=np.int32), [16, 32, 16])[None].repeat(48, axis=0)
+    lifted = lift(np.ascontiguousarray(rows), 3, Segments.of(found, 48, 64), view=2)
+    np.testing.assert_allclose(lifted.sums, [[0, 0, 0], [48 * 16, 0, 0], [48 * 16, 0, 0]])
+    np.testing.assert_array_equal(lifted.pixels, [48 * 16, 48 * 32, 48 * 16])
+    np.testing.assert_array_equal(lifted.mask, [-1, 2 * 65536, 2 * 65536])

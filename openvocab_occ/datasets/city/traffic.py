@@ -4,7 +4,7 @@ A simulation in steps of a tenth of a second; the ego takes part in it like any 
 intelligent driver model (Treiber, Hennecke, Helbing 2000).
 """
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
@@ -78,6 +78,14 @@ class Simulation:
     def __init__(self, graph: LaneGraph, drivers: list[Driver], walkers: list[Crosser]) -> None:
         self._graph, self._drivers, self._walkers = graph, drivers, walkers
         self._edges = [list(accumulate((graph.lanes[n].length for n in d.route), initial=0.0)) for d in drivers]
+        self._lines = [
+            (
+                lane.arc.tolist(),
+                lane.points[:, :2].tolist(),
+                np.arctan2(*np.diff(lane.points, axis=0).T[1::-1]).tolist(),
+            )
+            for lane in graph.lanes
+        ]  # scalars are faster than arrays of one
         self._holders: dict[int, set[int]] = {}  # turn -> drivers in it or let into it
         self._walked = np.zeros(len(walkers))
 
@@ -101,12 +109,13 @@ class Simulation:
 
     def _place(self, number: int, s: float) -> tuple[float, float, float]:
         k = self._lane(number, s)
-        lane = self._graph.lanes[self._drivers[number].route[k]]
+        lane_number = self._drivers[number].route[k]
         at = s - self._edges[number][k]
-        x, y = (float(np.interp(at, lane.arc, lane.points[:, axis])) for axis in (0, 1))
-        i = min(max(int(np.searchsorted(lane.arc, at)) - 1, 0), len(lane.points) - 2)
-        d = lane.points[i + 1] - lane.points[i]
-        return x, y, float(np.arctan2(d[1], d[0]))
+        arc, points, headings = self._lines[lane_number]
+        i = min(max(bisect_left(arc, at) - 1, 0), len(points) - 2)
+        share = min(max((at - arc[i]) / (arc[i + 1] - arc[i]), 0.0), 1.0)
+        (x0, y0), (x1, y1) = points[i], points[i + 1]
+        return x0 + share * (x1 - x0), y0 + share * (y1 - y0), headings[i]
 
     def _walk(self, cars: list[tuple[float, float]]) -> list[tuple[float, float]]:
         """Move the walkers; return where those on the road are."""
@@ -180,11 +189,15 @@ class Simulation:
                 gap = edges[k] - _WAIT - front
                 if gap < best:
                     best, speed = max(gap, 0.05), 0.0
+        x, y, _ = self._place(number, driver.s)
+        near = 18.0 + driver.length / 2 + 2.6
         for walker in crossing:
+            if (walker[0] - x) ** 2 + (walker[1] - y) ** 2 > near**2:
+                continue
             for reach in (2.0, 4.0, 7.0, 10.0, 14.0, 18.0):
                 if reach < best:
-                    x, y, _ = self._place(number, front + reach)
-                    if (walker[0] - x) ** 2 + (walker[1] - y) ** 2 < 2.6**2:
+                    there = self._place(number, front + reach)
+                    if (walker[0] - there[0]) ** 2 + (walker[1] - there[1]) ** 2 < 2.6**2:
                         best, speed = max(reach - 1.5, 0.05), 0.0
         return best, speed
 

@@ -12,7 +12,7 @@ from openvocab_occ.export.formats.octomap import read_bt, write_bt
 from openvocab_occ.export.formats.openlex3d import read_openlex3d, write_openlex3d
 from openvocab_occ.export.formats.pcd import read_pcd, write_pcd
 from openvocab_occ.export.formats.ply import read_ply, write_ply
-from openvocab_occ.export.formats.rerun_log import write_rrd
+from openvocab_occ.export.formats.rerun_log import read_rrd, write_rrd
 from openvocab_occ.io.files import PathLike, existing
 from openvocab_occ.objects import SceneMap
 
@@ -30,7 +30,7 @@ def _tree_points(path: PathLike) -> Cloud:
 
 _READERS: dict[str, Callable[[PathLike], Cloud]] = {
     ".ply": read_ply, ".pcd": read_pcd, ".las": read_las, ".laz": read_las, ".bt": _tree_points,
-    ".openlex3d": lambda path: read_openlex3d(path)[0],
+    ".openlex3d": lambda path: read_openlex3d(path)[0], ".rrd": read_rrd,
 }  # fmt: skip
 _POINT_WRITERS: dict[str, Callable[[Cloud, PathLike], Path]] = {
     ".ply": write_ply, ".pcd": write_pcd, ".las": write_las, ".laz": write_las,
@@ -41,7 +41,7 @@ _MAP_WRITERS: dict[str, Callable[[SceneMap, PathLike], Path]] = {
 
 
 def read_cloud(path: PathLike) -> Cloud:
-    """Read the points of a map or of a PLY, PCD, LAS, LAZ, OctoMap .bt (occupied cells) or .openlex3d."""
+    """Read the points of a map or of a PLY, PCD, LAS, LAZ, OctoMap .bt (occupied cells), .openlex3d or .rrd."""
     end = Path(path).suffix.lower()
     if end == ".ovmap":
         return Cloud.of(SceneMap.open(path))
