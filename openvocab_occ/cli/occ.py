@@ -55,7 +55,7 @@ class Drives:
 
         if self.kind != "nuscenes":
             raise ConfigError(f"{self.kind} has no splits", fix="name scenes by --scene")
-        tables = find_tables(Path(self.path))
+        tables = find_tables(Path(self.path), None)
         return sorted(scene_names_of(tables.parent, tables, str(self.split)))
 
 
