@@ -41,6 +41,15 @@ class LoadReport:
         return f"{len(self.loaded)} loaded" + "".join(f", {part}" for part in parts)
 
 
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """Tensors by name, and what else a file of ours says."""
+
+    state: dict[str, Tensor]
+    cameras: int | None = None
+    """Views that it was trained with."""
+
+
 def load_public_checkpoint(network: nn.Module, path: PathLike) -> LoadReport:
     """Fill a network from a file with `state_dict` or plain tensors; report every name that does not match.
 
@@ -50,6 +59,11 @@ def load_public_checkpoint(network: nn.Module, path: PathLike) -> LoadReport:
         UnsafeFileError: The file holds more than tensors and plain containers.
         ModelError: It cannot be read, or nothing in it fits.
     """
+    return fill(network, read_checkpoint(path).state)
+
+
+def read_checkpoint(path: PathLike) -> Checkpoint:
+    """Read the tensors of a checkpoint by their plain names; errors as of `load_public_checkpoint`."""
     file = existing(path, "checkpoint")
     try:
         content: Any = torch.load(file, map_location="cpu", weights_only=True)
@@ -65,7 +79,8 @@ def load_public_checkpoint(network: nn.Module, path: PathLike) -> LoadReport:
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
         raise ModelError(f"{file.name} has no state dict", expected="names and tensors", got=type(state).__name__)
     found = {_plain(name): value for name, value in state.items() if not _plain(name).startswith(IGNORED)}
-    return fill(network, found)
+    cameras = content.get("cameras") if isinstance(content, dict) else None
+    return Checkpoint(found, cameras if isinstance(cameras, int) else None)
 
 
 def fill(network: nn.Module, found: dict[str, Tensor]) -> LoadReport:

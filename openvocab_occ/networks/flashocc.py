@@ -1,6 +1,6 @@
 """FlashOcc (Yu et al. 2023): images to a ground feature to voxels, without 3D convolutions."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -48,6 +48,10 @@ TINY = FlashOccConfig(
     cell=0.8, shape=(100, 100, 8),
 )  # fmt: skip
 """For tests and CPUs: 0.8 m voxels, six images of 128 x 48."""
+MICRO = replace(
+    TINY, latent=32, depth_range=(1.0, 25.0, 1.0), context=24, neck=32, lower=(-20.0, -20.0, -1.0), shape=(50, 50, 8)
+)
+"""A quarter of TINY's ground, for smoke runs."""
 
 
 class FlashOcc(nn.Module):
@@ -73,7 +77,7 @@ class FlashOcc(nn.Module):
         return self.img_bev_encoder_neck(self.img_bev_encoder_backbone(bev))
 
     def image_features(self, images: Float[Tensor, "b n 3 h w"]) -> Float[Tensor, "b n c h2 w2"]:
-        """Return features at 1/16 of normalised images."""
+        """Return features at 1/16 (tiny ones at 1/8) of normalised images."""
         flat = images.flatten(0, 1)
         if self.config.public_quirks:
             flat = flat.flip(1)

@@ -54,6 +54,17 @@ class BevGrid:
         return torch.where(inside, flat, 0), inside.long()
 
 
+def inverse_3x3(m: Float[Tensor, "b n 3 3"]) -> Float[Tensor, "b n 3 3"]:
+    """Return inverses by cross products of the rows: ONNX has no operator that inverts."""
+    a, b, c = m.unbind(-2)
+
+    def cross(u: Tensor, v: Tensor) -> Tensor:
+        return u[..., [1, 2, 0]] * v[..., [2, 0, 1]] - u[..., [2, 0, 1]] * v[..., [1, 2, 0]]
+
+    columns = torch.stack([cross(b, c), cross(c, a), cross(a, b)], dim=-1)
+    return columns / (a * cross(b, c)).sum(dim=-1)[..., None, None]
+
+
 class LiftSplat(nn.Module):
     """Predict depth and context for each feature pixel, and add them up in the cells of a grid."""
 
@@ -101,7 +112,7 @@ class LiftSplat(nn.Module):
             indexing="ij",
         )
         pixels = torch.stack([u, v, torch.ones_like(u)], dim=-1).reshape(-1, 3)
-        rays = torch.einsum("bnij,pj->bnpi", torch.linalg.inv(K) @ torch.linalg.inv(rig.T_net_image), pixels)
+        rays = torch.einsum("bnij,pj->bnpi", inverse_3x3(rig.T_net_image @ K), pixels)
         depths = torch.tensor(self.depths, device=device)
         local = rays[:, :, None] * depths[None, None, :, None, None]  # b n d p 3; z is the depth
         ego = torch.einsum("bnij,bndpj->bndpi", rig.T_ego_cam[..., :3, :3], local)

@@ -1,7 +1,7 @@
 """Networks by name, and frames to logits."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -13,9 +13,9 @@ from openvocab_occ.datasets.frame import Frame
 from openvocab_occ.errors import ConfigError, DataError, ModelError, ShapeError
 from openvocab_occ.geometry import GridSpec, invert
 from openvocab_occ.io.files import PathLike
-from openvocab_occ.networks.checkpoint import LoadReport, load_public_checkpoint
+from openvocab_occ.networks.checkpoint import LoadReport, fill, read_checkpoint
 from openvocab_occ.networks.dhd import DHD_S, Dhd
-from openvocab_occ.networks.flashocc import M0, M1, TINY, FlashOcc, FlashOccConfig
+from openvocab_occ.networks.flashocc import M0, M1, MICRO, TINY, FlashOcc, FlashOccConfig
 from openvocab_occ.networks.fusion import FusionKind
 from openvocab_occ.networks.lift_splat import Rig
 from openvocab_occ.networks.lmop import Lmop
@@ -25,6 +25,7 @@ NETWORKS: dict[str, tuple[type[FlashOcc], FlashOccConfig]] = {
     "flashocc-m1": (FlashOcc, M1),
     "dhd-s": (Dhd, DHD_S),
     "flashocc-tiny": (FlashOcc, TINY),
+    "flashocc-micro": (FlashOcc, MICRO),
     "dhd-tiny": (Dhd, TINY),
 }
 CAMERA_ORDER = ("CAM_FRONT_LEFT", "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_LEFT", "CAM_BACK", "CAM_BACK_RIGHT")
@@ -36,8 +37,15 @@ _MEAN, _STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
 class Prior(Protocol):
     """What memory knows of a window; the record that a tile map's `read` returns."""
 
-    logits: Float32[np.ndarray, "x y z classes"]
-    known: Bool[np.ndarray, "x y z"]
+    @property
+    def logits(self) -> Float32[np.ndarray, "x y z classes"]:
+        """Class-centred log-probabilities, 0 where not known."""
+        ...
+
+    @property
+    def known(self) -> Bool[np.ndarray, "x y z"]:
+        """Which voxels the map has seen."""
+        ...
 
 
 def load_network(
@@ -53,7 +61,7 @@ def load_network(
 
     Args:
         name: `flashocc-m0`, `flashocc-m1`, `dhd-s` (256 x 704 images, 0.4 m voxels of Occ3D), `flashocc-tiny` or
-            `dhd-tiny` (48 x 128, 0.8 m).
+            `dhd-tiny` (48 x 128, 0.8 m), `flashocc-micro` (those within 20 m).
         weights: A checkpoint of ours or a public one; without it the weights are random and its predictions noise.
         memory: Wrap it with a memory prior (LMPOcc).
         fusion: How prior and current feature are fused.
@@ -68,31 +76,45 @@ def load_network(
         config = replace(config, public_quirks=True)
     baseline = kind(config)
     network = Lmop(baseline, fusion=fusion) if memory else baseline
-    report = None
+    report, cameras = None, None
     if weights is not None:
-        report = load_public_checkpoint(network if not memory or _is_memory(weights) else baseline, weights)
-        if isinstance(network, Lmop) and not _is_memory(weights):
+        content = read_checkpoint(weights)
+        whole = any(name.startswith("fusion.") for name in content.state)
+        report = fill(network if not memory or whole else baseline, content.state)
+        cameras = content.cameras
+        if isinstance(network, Lmop) and not whole:
             network.occ_head.load_state_dict(baseline.occ_head.state_dict())
-    return OccupancyNetwork(name, network.to(device).eval(), config, report)
+    return OccupancyNetwork(name, network.to(device).eval(), config, report, cameras)
 
 
-def _is_memory(weights: PathLike) -> bool:
-    content = torch.load(weights, map_location="cpu", weights_only=True)
-    state = content.get("state_dict", content)
-    return any(name.startswith(("fusion.", "module.fusion.")) for name in state)
+def has_memory(weights: PathLike) -> bool:
+    """Tell whether a checkpoint is of a network with memory."""
+    return any(name.startswith("fusion.") for name in read_checkpoint(weights).state)
 
 
 class OccupancyNetwork:
     """A network with what surrounds it: image preparation, device, and the grid it predicts."""
 
     def __init__(
-        self, name: str, module: FlashOcc | Lmop, config: FlashOccConfig, report: LoadReport | None = None
+        self,
+        name: str,
+        module: FlashOcc | Lmop,
+        config: FlashOccConfig,
+        report: LoadReport | None = None,
+        cameras: int | None = None,
     ) -> None:
         self.name = name
         self.module = module
         self.config = config
         self.report = report
         """How the checkpoint's names met the network's; None without one."""
+        self.cameras = cameras
+        """Views that it was trained with, where the checkpoint says so."""
+
+    @property
+    def memory(self) -> bool:
+        """Whether it reads a prior."""
+        return isinstance(self.module, Lmop)
 
     @property
     def spec(self) -> GridSpec:
@@ -119,33 +141,16 @@ class OccupancyNetwork:
         except torch.OutOfMemoryError as error:
             raise ModelError(f"{self.name} does not fit into the memory of {device}", got=str(error).splitlines()[0],
                              fix="choose a smaller network or device='cpu'") from error  # fmt: skip
-        return logits[0].float().cpu().numpy()
+        found = logits[0].float().cpu().numpy()
+        if not np.isfinite(found).all():
+            raise ModelError(f"{self.name} gives no numbers for frame {frame.index}", expected="finite logits",
+                             fix="look at the weights, and at K and poses of the cameras")  # fmt: skip
+        return found
 
     def prepare(self, frame: Frame) -> tuple[Float[Tensor, "1 n 3 h w"], Rig]:
         """Return normalised images and their rig, as `predict` feeds them."""
-        if not frame.views:
-            raise DataError(f"frame {frame.index} has no views", expected="one image a camera")
-        order = {camera: k for k, camera in enumerate(CAMERA_ORDER)}
-        views = sorted(frame.views, key=lambda view: order.get(view.name, len(order)))
-        key = frame.T_world_ego
-        if self.config.public_quirks:
-            key = frame.poses.get("cam_front_left_ego", key)
-        images: list[np.ndarray] = []
-        moves: list[np.ndarray] = []
-        for view in views:
-            if view.camera.lens != "pinhole":
-                raise DataError(
-                    f"view {view.name!r} is distorted", expected="a pinhole camera", fix="undistort it first"
-                )
-            image, move = fit_image(view.image, self.config.image_size)
-            images.append((image.astype(np.float32) - _MEAN) / _STD)
-            moves.append(move)
-        planes = torch.from_numpy(np.stack(images).astype(np.float32)).permute(0, 3, 1, 2)[None].contiguous()
-        T_ego_cam = np.stack([invert(key) @ view.camera.T_world_cam for view in views])
-        return planes, Rig(
-            K=_batch([view.camera.K for view in views]), T_ego_cam=_batch(list(T_ego_cam)),
-            T_net_image=_batch(moves), T_bev_ego=torch.eye(3)[None],
-        )  # fmt: skip
+        views = fit_views(frame, self.config)
+        return normalise(views.images[None]), views.rig()
 
     def _prior(self, prior: Prior | None, device: torch.device) -> tuple[Tensor, Tensor]:
         shape = (*self.config.shape, self.config.classes)
@@ -156,6 +161,53 @@ class OccupancyNetwork:
                              fix="read it with the network's spec, from a map of the same classes")  # fmt: skip
         logits = torch.from_numpy(np.ascontiguousarray(prior.logits, dtype=np.float32))[None]
         return logits.to(device), torch.from_numpy(np.ascontiguousarray(prior.known, dtype=bool))[None].to(device)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedViews:
+    """Views of a frame as a network takes them, before their colours are normalised."""
+
+    images: UInt8[np.ndarray, "n h w 3"]
+    K: Float32[np.ndarray, "n 3 3"]
+    """Of the original images."""
+    T_ego_cam: Float32[np.ndarray, "n 4 4"]
+    T_net_image: Float32[np.ndarray, "n 3 3"]
+    """Pixel of the original image to pixel here."""
+
+    def rig(self) -> Rig:
+        """Return a batch of one rig."""
+        K, T, move = (torch.from_numpy(a)[None] for a in (self.K, self.T_ego_cam, self.T_net_image))
+        return Rig(K=K, T_ego_cam=T, T_net_image=move, T_bev_ego=torch.eye(3)[None])
+
+
+def fit_views(frame: Frame, config: FlashOccConfig) -> FittedViews:
+    """Order, scale and crop the views of a frame to a network's input.
+
+    Raises:
+        DataError: There are none, or one is distorted.
+    """
+    if not frame.views:
+        raise DataError(f"frame {frame.index} has no views", expected="one image a camera")
+    order = {camera: k for k, camera in enumerate(CAMERA_ORDER)}
+    views = sorted(frame.views, key=lambda view: order.get(view.name, len(order)))
+    key = frame.T_world_ego
+    if config.public_quirks:
+        key = frame.poses.get("cam_front_left_ego", key)
+    for view in views:
+        if view.camera.lens != "pinhole":
+            raise DataError(f"view {view.name!r} is distorted", expected="a pinhole camera", fix="undistort it first")
+    fitted = [fit_image(view.image, config.image_size) for view in views]
+    T_ego_cam = [invert(key) @ view.camera.T_world_cam for view in views]
+    return FittedViews(
+        np.stack([image for image, _ in fitted]), _stack([view.camera.K for view in views]), _stack(T_ego_cam),
+        _stack([move for _, move in fitted]),
+    )  # fmt: skip
+
+
+def normalise(images: UInt8[np.ndarray, "b n h w 3"]) -> Float[Tensor, "b n 3 h w"]:
+    """Return RGB images about the mean, in standard deviations (ImageNet's)."""
+    planes = (images.astype(np.float32) - np.array(_MEAN, np.float32)) / np.array(_STD, np.float32)
+    return torch.from_numpy(planes).permute(0, 1, 4, 2, 3).contiguous()
 
 
 def fit_image(
@@ -174,5 +226,5 @@ def fit_image(
     return np.ascontiguousarray(small[top : top + size[0], left : left + size[1]]), move
 
 
-def _batch(matrices: Sequence[np.ndarray]) -> Tensor:
-    return torch.from_numpy(np.stack(matrices).astype(np.float32))[None]
+def _stack(matrices: Sequence[np.ndarray]) -> Float32[np.ndarray, "n a b"]:
+    return np.stack(matrices).astype(np.float32)

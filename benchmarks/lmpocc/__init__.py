@@ -1,0 +1,1 @@
+"""LMPOcc's experiments on the demo city."""

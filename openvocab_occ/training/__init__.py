@@ -1,0 +1,1 @@
+"""Training of occupancy networks, with and without long-term memory."""

@@ -1,0 +1,81 @@
+"""A map in memory is a tile map without disk; its other policies are their formulae."""
+
+import numpy as np
+import pytest
+
+from openvocab_occ.errors import ConfigError
+from openvocab_occ.geometry import GridSpec, pose
+from openvocab_occ.memory import TileMap
+from openvocab_occ.training.stream_map import BAYES_LIMIT, EMA_SHARE, StreamMap
+
+SPEC = GridSpec((-8.0, -8.0, -1.0), 0.8, (20, 20, 4))
+NAMES = ("road", "wall", "free")
+
+
+def at(x: float, y: float, yaw: float) -> np.ndarray:
+    return pose((x, y, 0.0), (np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)))
+
+
+def writes(rng, count=4):
+    for n in range(count):
+        T = at(*rng.uniform(-6, 6, 2), rng.uniform(-np.pi, np.pi))
+        yield n, T, rng.normal(0, 2, (*SPEC.shape, 3)).astype(np.float32), rng.random(SPEC.shape) < 0.6
+
+
+def new() -> StreamMap:
+    return StreamMap(np.array([-8.0, -8.0]), np.array([8.0, 8.0]), SPEC, 3)
+
+
+def test_agrees_with_the_tile_map(rng, tmp_path):
+    city = TileMap.create(tmp_path / "c.tiles", NAMES, heights=4, cell=0.8, z0=-1.0, dtype="float16", journal=False)
+    stream = new()
+    for n, T, logits, mask in writes(rng):
+        city.write(logits, mask, T, SPEC, stamp=1000.0 + n, agent="a", log="l")
+        stream.write(T, logits, mask)
+    for T in (at(0, 0, 0), at(3.1, -2.2, 0.7), at(-20, 0, 2.0)):
+        ours, theirs = stream.read(T), city.read(T, SPEC)
+        np.testing.assert_array_equal(ours.known, theirs.known)
+        np.testing.assert_allclose(ours.logits, theirs.logits, atol=2e-2)
+    assert stream.read(at(0, 0, 0)).known.mean() > 0.3
+
+
+def test_copies_live_apart(rng):
+    stream = new()
+    before = stream.copy()
+    _, T, logits, mask = next(writes(rng))
+    stream.write(T, logits, mask)
+    assert not before.read(T).known.any()
+    assert stream.read(T).known.any()
+
+
+@pytest.mark.parametrize("policy", ["newest", "overwrite", "ema", "bayes"])
+def test_policies_are_their_formulae(policy, rng):
+    """At a pose on the lattice every voxel is its own map voxel."""
+    stream, T = new(), at(0, 0, 0)
+    (_, _, first, seen), (_, _, second, again) = (next(writes(rng)) for _ in range(2))
+    a, b = (x - x.mean(-1, keepdims=True) for x in (first, second))
+    stream.write(T, first, seen)
+    stream.write(T, second, again, policy=policy)
+    found = stream.read(T)
+    both, only = seen & again, again & ~seen
+    mixed = {"newest": b, "overwrite": b, "ema": a + EMA_SHARE * (b - a),
+             "bayes": np.clip(a + b, -BAYES_LIMIT, BAYES_LIMIT)}[policy]  # fmt: skip
+    np.testing.assert_allclose(found.logits[both], mixed[both], atol=1e-2)
+    np.testing.assert_allclose(found.logits[only], b[only], atol=1e-2)
+    np.testing.assert_array_equal(found.known, again if policy == "overwrite" else seen | again)
+    if policy != "overwrite":
+        np.testing.assert_allclose(found.logits[seen & ~again], a[seen & ~again], atol=1e-2)
+
+
+def test_gate_lies_between_keeping_and_replacing(rng):
+    (_, _, first, _), (_, _, second, _) = (next(writes(rng)) for _ in range(2))
+    everything, T = np.ones(SPEC.shape, bool), at(0, 0, 0)
+    found = {}
+    for share in (0.0, 0.25, 1.0):
+        stream = new()
+        stream.write(T, first, everything)
+        stream.write(T, second, everything, policy="gate", gate=np.full(SPEC.shape, share, np.float32))
+        found[share] = stream.read(T).logits
+    np.testing.assert_allclose(found[0.25], 0.75 * found[0.0] + 0.25 * found[1.0], atol=1e-2)
+    with pytest.raises(ConfigError, match="policy is not known"):
+        new().write(T, first, everything, policy="gate")
