@@ -65,10 +65,16 @@ class _Window:
 class Renderer:
     """Draws one map from many places; keeps the part of it around the last place as a dense grid with its faces."""
 
-    def __init__(self, scene: SceneMap, *, filled: bool = False) -> None:
-        """Take a map; `filled` closes holes of one voxel in surfaces, for pictures that people look at."""
+    def __init__(self, scene: SceneMap, *, filled: bool = False, device: str | None = None) -> None:
+        """Take a map.
+
+        Args:
+            scene: The map.
+            filled: Close holes of one voxel in surfaces, for pictures that people look at.
+            device: Of `render_depth`, for `view`: `cuda` walks the rays on a GPU.
+        """
         self.surface = surface_of(scene)
-        self.filled = filled
+        self.filled, self.device = filled, device
         self._window: _Window | None = None
         keys = self.surface.keys
         self._bounds = (keys.min(axis=0).astype(np.int64), keys.max(axis=0).astype(np.int64) + 1) if len(keys) else None
@@ -80,7 +86,7 @@ class Renderer:
         if window is None:
             depth = np.full(size, max_depth, np.float32)
             return MapView(camera, depth, np.full(size, -1, np.int32), np.zeros(size, np.int32), self.surface)
-        image = render_depth(window.grid, camera, max_depth=max_depth)
+        image = render_depth(window.grid, camera, max_depth=max_depth, device=self.device)
         voxel = window.row[image.voxel]  # -1 reads the last entry
         return MapView(camera, image.depth, voxel, self._items(voxel), self.surface)
 

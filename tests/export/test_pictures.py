@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from openvocab_occ.depth.render import render_depth
+from openvocab_occ.errors import ConfigError
 from openvocab_occ.export import draw
 from openvocab_occ.export._shade_reference import shade_reference
 from openvocab_occ.export.overhead import CEILING, Extent, render_overhead
@@ -179,3 +180,15 @@ def test_a_tag_lies_on_an_object_that_has_room_for_it():
 
 def test_there_may_be_no_room_at_all():
     assert place_tags((12, 12), {1: (5.0, 5.0)}, np.ones((12, 12), np.int32)) == []
+
+
+@pytest.mark.gpu
+def test_a_gpu_draws_the_same(street):
+    import torch
+
+    if not torch.cuda.is_available():
+        with pytest.raises(ConfigError, match="torch cannot use this device: .*got cuda"):
+            Renderer(street, device="cuda").view(CAMERA, 50.0)
+        return
+    one, other = Renderer(street).view(CAMERA, 50.0), Renderer(street, device="cuda").view(CAMERA, 50.0)
+    assert (one.voxel == other.voxel).mean() > 0.999
