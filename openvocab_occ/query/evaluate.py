@@ -344,7 +344,9 @@ class Evaluator:
         return size.prod(axis=1) if name == "volume" else size[:, ("length", "width", "height").index(name)]
 
     def _on_level(self) -> Bool[np.ndarray, " n"]:
-        return self.index.on_levels(self._levels)
+        on = self.index.on_levels(self._levels)
+        # a region of things alone, such as a front of buildings, would name them again
+        return on & ~self.index.regions_of_things if self._levels == DEFAULT_LEVELS else on
 
     def _masked(self, clause: Clause) -> Clause:
         on = self._on_level()

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from openvocab_occ.objects.scene_map import SceneMap
-from openvocab_occ.objects.tree import SCENE, SceneObject
+from openvocab_occ.objects.tree import REGION, SCENE, SceneObject
 from openvocab_occ.query import colors
 from openvocab_occ.query.boxes import Boxes
 from openvocab_occ.query.relations import Anchor, Columns
@@ -42,6 +42,11 @@ class Index:
         """One row a node."""
         rows = [node.embedding for node in self.nodes]
         return np.stack(rows).astype(np.float32, copy=False) if rows else np.zeros((0, self._dim), np.float32)
+
+    @cached_property
+    def regions_of_things(self) -> Bool[np.ndarray, " n"]:
+        """Tell which nodes are regions without voxels of their own."""
+        return np.array([node.level == REGION and not len(node.voxels) for node in self.nodes], dtype=bool)
 
     @cached_property
     def row_of(self) -> Mapping[int, int]:

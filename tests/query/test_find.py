@@ -223,6 +223,19 @@ def test_text_that_is_no_query_is_told(street, text, message):
             ask(street, text)
 
 
+def test_a_row_of_things_is_not_named_beside_them(town):
+    """A region without voxels of its own answers only to its level; one of ground answers as a thing does."""
+    first = town.objects[1]
+    row = replace(first, id=90, level="region", voxels=np.empty(0, np.int64), children=(), parent=0)
+    lot = replace(first, id=91, level="region", children=(), parent=0)
+    nodes = list(town.objects.nodes)
+    nodes[0] = replace(nodes[0], children=(*nodes[0].children, 90, 91))
+    scene = SceneMap(town.voxels, ObjectTree([*nodes, row, lot]), town.encoder, town.frames)
+    assert sorted(hit.object.id for hit in find(scene, "trucks").hits) == [1, 2, 3, 91]
+    in_regions = q.Level(q.Noun("truck"), "region")
+    assert sorted(hit.object.id for hit in find(scene, in_regions).hits) == [90, 91]
+
+
 def test_options_and_kinds_that_make_no_sense_are_told(street, monkeypatch):
     with pytest.raises(ConfigError, match="limit is not usable"):
         find(street, "car", limit=0)
