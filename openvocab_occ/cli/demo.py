@@ -29,7 +29,8 @@ def demo(*, out: Path = Path("out/demo"), no_view: bool = False, port: int = 808
     started = time.perf_counter()
     encoder = load_encoder(demo_model())
     with progress("driving through a synthetic city") as advance:
-        scene = build_map(load_sequence("city", seed=_SEED, frames=_FRAMES), encoder, progress=advance)
+        sequence = load_sequence("city", seed=_SEED, frames=_FRAMES)
+        scene = build_map(sequence, encoder, progress=advance)
     path = out / "city.ovmap"
     scene.save(path)
     answer = find(scene, QUESTION, encoder)
@@ -53,7 +54,7 @@ def demo(*, out: Path = Path("out/demo"), no_view: bool = False, port: int = 808
     if not no_view:
         from openvocab_occ.viewer import server
 
-        running = server.view(scene, encoder, port=port, block=False)
+        running = server.view(scene, encoder, sequence=sequence, port=port, block=False)
         if not json:
             console().print(f"the map at [bold]{running.url}[/bold]  (Ctrl-C ends)")
         running.wait()

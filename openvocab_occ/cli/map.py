@@ -2,9 +2,10 @@
 
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
+from rich.console import Console
 from rich.table import Table
 
 from openvocab_occ.cli.output import console, print_json, progress
@@ -12,6 +13,9 @@ from openvocab_occ.cli.source import Source
 from openvocab_occ.io.files import output_folder
 from openvocab_occ.objects.ovmap import MANIFEST
 from openvocab_occ.objects.scene_map import SceneMap
+
+if TYPE_CHECKING:
+    from openvocab_occ.viewer import Viewer
 
 
 def build(
@@ -23,6 +27,8 @@ def build(
     voxel_size: float | None = None,
     max_depth: float = 60.0,
     sandbox: bool = False,
+    watch: bool = False,
+    port: int = 8080,
     json: bool = False,
 ) -> None:
     """Turn a drive and an ONNX model into a map.
@@ -35,19 +41,38 @@ def build(
         voxel_size: Edge of a map voxel in metres; that of the occupancy grid by default.
         max_depth: Pixels beyond this z-depth are not lifted, metres.
         sandbox: Run the model in a child process with limited memory, which can write no file.
+        watch: Show the map in the web browser while it grows, and serve it when it is done, until Ctrl-C.
+        port: Port of that page.
         json: Print one JSON object.
     """
-    from openvocab_occ.pipeline.build import build_map
+    from openvocab_occ.pipeline.build import MapBuilder, build_map
     from openvocab_occ.segmentation.onnx import load_encoder
 
     started = time.perf_counter()
     output_folder(out, marker=MANIFEST)
     model = load_encoder(encoder, card, sandbox=sandbox)
+    viewer = None
+    sequence = source.load()
     with progress("mapping") as advance:
-        scene = build_map(source.load(), model, voxel_size=voxel_size, max_depth=max_depth, progress=advance)
+        if watch:
+            from openvocab_occ.objects import Provenance
+            from openvocab_occ.viewer.live import view_build
+
+            made = Provenance(source=sequence.source, name=sequence.name, synthetic=sequence.synthetic)
+            builder = MapBuilder(model, voxel_size=voxel_size, max_depth=max_depth, provenance=made)
+            viewer = view_build(sequence, model, builder, port=port, started=_announce, progress=advance)
+            scene = viewer.scene
+        else:
+            scene = build_map(sequence, model, voxel_size=voxel_size, max_depth=max_depth, progress=advance)
     scene.save(out)
     report = {"map": str(out), "seconds": round(time.perf_counter() - started, 2), **summary(scene, out)}
     print_json(report) if json else _print(report)
+    if viewer is not None:
+        viewer.wait()
+
+
+def _announce(viewer: "Viewer") -> None:
+    Console(stderr=True).print(f"the map so far at [bold]{viewer.url}[/bold]")
 
 
 def summary(scene: SceneMap, path: Path) -> dict[str, Any]:

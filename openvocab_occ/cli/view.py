@@ -1,5 +1,6 @@
 """`openvocab-occ view`."""
 
+import contextlib
 from pathlib import Path
 from typing import Annotated
 
@@ -13,28 +14,63 @@ def view(
     *,
     encoder: Path | None = None,
     card: Path | None = None,
+    images: tuple[str, str] | None = None,
+    option: tuple[str, ...] = (),
+    earlier: Path | None = None,
+    tiles: Path | None = None,
+    follow: bool = False,
     host: str = "127.0.0.1",
     port: int = 8080,
+    token: str | None = None,
     json: bool = False,
 ) -> None:
     """Show a map in the web browser; Ctrl-C ends it.
 
     Args:
-        map: A saved map, NAME.ovmap.
+        map: A saved map, NAME.ovmap, or a folder of them.
         encoder: The ONNX model that made the map; needed where words become vectors (dense models).
         card: The model's card, if it does not lie beside it.
-        host: Address to listen on; only this machine by default.
-        port: Port to listen on.
+        images: Kind and path of the drive, as `map` takes them, for the photos; a map holds none.
+        option: Options of that kind, each KEY=VALUE.
+        earlier: A map of the same place; what differs from it is marked.
+        tiles: A global map, NAME.tiles, to be shown around it.
+        follow: Show the map anew whenever it is written again.
+        host: Address to listen on; others than this machine's own need a token.
+        port: Port to listen on; 0 takes any free one.
+        token: What visitors must have: 16 or more letters, digits, - and _; or "new".
         json: Print one JSON object with the address, then serve.
     """
+    import secrets
+
+    from openvocab_occ.cli.source import Source
+    from openvocab_occ.memory import TileMap
     from openvocab_occ.objects.scene_map import SceneMap
     from openvocab_occ.segmentation.onnx import load_encoder
     from openvocab_occ.viewer import server
+    from openvocab_occ.viewer.layers import ChangesLayer, Layer, TileMapLayer
+    from openvocab_occ.viewer.live import Follower
 
-    model = load_encoder(encoder, card) if encoder else None
-    running = server.view(SceneMap.open(map), model, host=host, port=port, block=False)
-    if json:
-        print_json({"url": running.url, "map": str(map)})
-    else:
-        console().print(f"{map} at [bold]{running.url}[/bold]  (Ctrl-C ends)")
-    running.wait()
+    layers: list[Layer] = []
+    shown = SceneMap.open(map) if earlier or tiles else map
+    if earlier and isinstance(shown, SceneMap):
+        layers.append(ChangesLayer(shown, SceneMap.open(earlier)))
+    if tiles and isinstance(shown, SceneMap):
+        layers.append(TileMapLayer(TileMap.open(str(tiles), writable=False), scene=shown))
+    running = server.view(
+        shown,
+        load_encoder(encoder, card) if encoder else None,
+        sequence=Source(*images, option=list(option)).load() if images else None,
+        layers=layers,
+        host=host,
+        port=port,
+        token=secrets.token_urlsafe() if token == "new" else token,
+        block=False,
+    )
+    with contextlib.ExitStack() as stack:
+        if follow:
+            stack.enter_context(Follower(running, map))
+        if json:
+            print_json({"url": running.invitation, "map": str(map)})
+        else:
+            console().print(f"{map} at [bold]{running.invitation}[/bold]  (Ctrl-C ends)", soft_wrap=True)
+        running.wait()

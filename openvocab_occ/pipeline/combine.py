@@ -50,8 +50,12 @@ def crop(scene: SceneMap, region: Float[np.ndarray, "2 3"]) -> SceneMap:
     """
     if region.shape != (2, 3) or not np.isfinite(region).all() or (region[0] >= region[1]).any():
         raise ConfigError("region is not a box", expected="lower and upper corner, metres", got=region.tolist())
-    inside = ((scene.voxels.centers >= region[0]) & (scene.voxels.centers < region[1])).all(axis=1)
-    return replace(scene, voxels=scene.voxels.subset(inside), objects=ObjectTree(_kept(scene, inside)))
+    return only(scene, ((scene.voxels.centers >= region[0]) & (scene.voxels.centers < region[1])).all(axis=1))
+
+
+def only(scene: SceneMap, chosen: Bool[np.ndarray, " n"]) -> SceneMap:
+    """Return some voxels of a map and the objects they are of; see `crop`."""
+    return replace(scene, voxels=scene.voxels.subset(chosen), objects=ObjectTree(_kept(scene, chosen)))
 
 
 def concat(scenes: Sequence[SceneMap]) -> SceneMap:

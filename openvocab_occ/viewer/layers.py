@@ -1,162 +1,205 @@
-"""The map as nodes of a viser scene: tiled points, boxes of hits, the path of the drive."""
+"""What can be shown beside the voxels of a map; the list is open: anything with a name that can draw itself."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Float32, Int64, UInt8
+from jaxtyping import Float64
 
-from openvocab_occ.errors import ConfigError
-from openvocab_occ.export.palette import grey, paint_labels, paint_numbers
-from openvocab_occ.export.semantics import name_voxels
-from openvocab_occ.mapping.voxel_map import VoxelMap
-from openvocab_occ.objects.box import Box
+from openvocab_occ.export.palette import label_colors
+from openvocab_occ.mapping.keys import pack
+from openvocab_occ.memory.tile_map import TileMap
+from openvocab_occ.objects.compare import diff_objects
 from openvocab_occ.objects.scene_map import SceneMap
 from openvocab_occ.objects.tree import SceneObject
+from openvocab_occ.pipeline.compare import diff
+from openvocab_occ.viewer.drawing import PATH_COLOR, box_edges, draw_line, draw_points
+from openvocab_occ.viewer.markup import swatches
 
 if TYPE_CHECKING:
     import viser
 
-ColorMode = Literal["image", "semantic", "height", "relevance"]
-COLOR_MODES: tuple[str, ...] = get_args(ColorMode)
-TILE_EDGE = 32.0  # metres; points go to the browser as float16, which is within 8 mm at 16 m from a tile's centre
-HIT_COLOR = (255, 64, 0)
-_WALL_SHADE = 0.82
-_PATH_COLOR = (20, 110, 160)
-_EDGES = np.array(
-    [(i, (i + 1) % 4) for i in range(4)] + [(4 + i, 4 + (i + 1) % 4) for i in range(4)] + [(i, 4 + i) for i in range(4)]
-)
+APPEARED_COLOR, VANISHED_COLOR, CHANGED_COLOR = (0, 114, 178), (213, 94, 0), (240, 228, 66)
+FREE_COLOR, UNKNOWN_COLOR = (86, 180, 233), (70, 70, 70)
+_MOST_POINTS = 500_000  # of one layer
+_PATH_RISE = 1.0  # metres above the ego's origin, clear of the voxels of the ground
+
+
+@runtime_checkable
+class Layer(Protocol):
+    """Something to switch on and off on the page; one serves all browsers, from several threads."""
+
+    @property
+    def name(self) -> str:
+        """What the switch says; no two of a viewer alike."""
+        ...
+
+    @property
+    def shown(self) -> bool:
+        """Whether it is on at first."""
+        ...
+
+    def draw(self, nodes: "viser.SceneApi", folder: str) -> str:
+        """Add nodes below `folder`, a name such as /layers/3, and return the legend as HTML, "" for none.
+
+        Text that comes from data is escaped by `markup.escape`. Called off the callback threads; may take its time.
+        """
+        ...
 
 
 @dataclass(frozen=True, eq=False)
-class Tile:
-    """Voxels of one cube of space."""
+class PathLayer:
+    """The way of the ego."""
 
-    name: str
-    """Name of its node in the scene."""
-    center: Float[np.ndarray, " 3"]
-    """Middle of the cube, world, metres; the node is put here."""
-    voxels: Int64[np.ndarray, " n"]
-    """Positions in the map."""
-    points: Float32[np.ndarray, "n 3"]
-    """Their centres relative to `center`."""
+    path: Float64[np.ndarray, "n 3"]
+    name: str = "drive"
+    shown: bool = True
 
-
-def tile_voxels(centers: Float[np.ndarray, "n 3"], edge: float = TILE_EDGE) -> list[Tile]:
-    """Sort voxels into cubes of this edge; each voxel is in exactly one."""
-    if not len(centers):
-        return []
-    cells, members = np.unique(np.floor(centers / edge).astype(np.int64), axis=0, return_inverse=True)
-    members = members.reshape(-1)
-    order = np.argsort(members, kind="stable")
-    groups = np.split(order, np.cumsum(np.bincount(members))[:-1])
-    tiles = []
-    for cell, voxels in zip(cells, groups, strict=True):
-        center = (cell + 0.5) * edge
-        name = "/map/tile_{}_{}_{}".format(*cell).replace("-", "m")
-        tiles.append(Tile(name, center, voxels, (centers[voxels] - center).astype(np.float32)))
-    return tiles
+    def draw(self, nodes: "viser.SceneApi", folder: str) -> str:
+        """Draw a line through all frames."""
+        draw_line(nodes, f"{folder}/line", self.path + np.array([0.0, 0.0, _PATH_RISE]), PATH_COLOR)
+        return ""
 
 
-def voxel_colors(
-    scene: SceneMap, mode: str, scores: Float32[np.ndarray, " n"] | None = None
-) -> UInt8[np.ndarray, "n 3"]:
-    """Return the colour of each voxel.
+@dataclass(frozen=True, eq=False)
+class GridLayer:
+    """A grid on the ground, whose squares are ten metres wide."""
 
-    `image` is the colour the cameras saw, `semantic` that of its label, a little darker on walls; `height` runs from
-    the 1st to the 99th percentile; `relevance` from the least of `scores`, grey, to the greatest.
-    """
-    voxels = scene.voxels
-    if mode == "image":
-        return voxels.colors
-    if mode == "semantic":
-        semantics = name_voxels(scene)
-        return shade_walls(voxels, paint_labels(semantics.labels, semantics.names))
-    if mode == "height":
-        return paint_numbers(voxels.centers[:, 2], *height_range(scene), "viridis")
-    if mode == "relevance":
-        if scores is None:
-            raise ConfigError("relevance needs a query", expected="a score for each voxel")
-        low, high = score_range(scores)
-        weight = np.clip(3 * (scores - low) / max(high - low, 1e-12), 0, 1)[:, None]  # grey below, pure from a third on
-        heat = paint_numbers(scores.astype(np.float64), low, high, "plasma")
-        ground = shade_walls(voxels, grey(voxels.colors))
-        return (weight * heat + (1 - weight) * ground).astype(np.uint8)
-    raise ConfigError("colour mode is not known", expected=" or ".join(COLOR_MODES), got=mode)
+    scene: SceneMap
+    name: str = "10 m grid"
+    shown: bool = False
 
-
-def shade_walls(voxels: VoxelMap, colors: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
-    """Darken voxels that have another above them, so that flat colours still show shapes."""
-    covered = voxels.index(voxels.keys + np.array([0, 0, 1], np.int32)) >= 0
-    return np.where(covered[:, None], (colors * _WALL_SHADE).astype(np.uint8), colors)
-
-
-def height_range(scene: SceneMap) -> tuple[float, float]:
-    """Return the heights, metres, that `height` colours run between."""
-    z = scene.voxels.centers[:, 2]
-    low, high = np.percentile(z, (1, 99)) if len(z) else (0.0, 1.0)
-    return float(low), float(high)
-
-
-def score_range(scores: Float32[np.ndarray, " n"]) -> tuple[float, float]:
-    """Return the least and the greatest finite score."""
-    finite = scores[np.isfinite(scores)]
-    return (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
-
-
-def grey_but(colors: UInt8[np.ndarray, "n 3"], objects: Sequence[SceneObject]) -> UInt8[np.ndarray, "n 3"]:
-    """Return the colours with every voxel greyed that is in none of the objects."""
-    pale = grey(colors)
-    for item in objects:
-        pale[item.voxels] = colors[item.voxels]
-    return pale
-
-
-def box_edges(box: Box, margin: float = 0.0) -> Float32[np.ndarray, "12 2 3"]:
-    """Return the ends of the twelve edges of a box, world, this many metres outside it."""
-    return Box(box.center, box.size + 2 * margin, box.yaw).corners[_EDGES].astype(np.float32)
-
-
-def draw_map(
-    nodes: "viser.SceneApi", tiles: Sequence[Tile], colors: UInt8[np.ndarray, "n 3"], voxel_size: float
-) -> "list[viser.PointCloudHandle]":
-    """Add the tiles as flat squares of the voxels' size.
-
-    On a client's own scene they cover the shared ones of the same name, for that client alone.
-    """
-    return [
-        nodes.add_point_cloud(
-            tile.name,
-            tile.points,
-            colors[tile.voxels],
-            point_size=voxel_size,
-            point_shape="square",
-            point_shading="flat",
-            position=tile.center,
+    def draw(self, nodes: "viser.SceneApi", folder: str) -> str:
+        """Draw lines at whole tens of metres, on the lowest tenth of the map."""
+        centers = self.scene.voxels.centers
+        low, high = np.floor(centers.min(axis=0) / 10) * 10, np.ceil(centers.max(axis=0) / 10) * 10
+        z = float(np.percentile(centers[:, 2], 10))
+        lines = [[(x, low[1], z), (x, high[1], z)] for x in np.arange(low[0], high[0] + 1, 10.0)]
+        lines += [[(low[0], y, z), (high[0], y, z)] for y in np.arange(low[1], high[1] + 1, 10.0)]
+        nodes.add_line_segments(
+            f"{folder}/lines", np.array(lines, np.float32), (140, 140, 140), thickness=1.0, thickness_units="screen"
         )
-        for tile in tiles
-    ]
+        return "lines at whole tens of metres"
 
 
-def draw_path(nodes: "viser.SceneApi", positions: Float[np.ndarray, "n 3"]) -> None:
-    """Add the way of the ego through the map as a line, if it moved."""
-    if len(positions) > 1:
-        segments = np.stack([positions[:-1], positions[1:]], axis=1).astype(np.float32)  # [n - 1, 2, 3]
-        nodes.add_line_segments("/path", segments, _PATH_COLOR, thickness=3.0, thickness_units="screen")
+@dataclass(frozen=True, eq=False)
+class SliceLayer:
+    """What is free and what nobody saw, in a level cut through the map."""
+
+    scene: SceneMap
+    above: float = 1.0
+    """Metres above the ground (the lowest tenth of the map) at which the cut lies."""
+    name: str = "free space"
+    shown: bool = False
+
+    def draw(self, nodes: "viser.SceneApi", folder: str) -> str:
+        """Draw a square for each cell of the cut that holds no voxel."""
+        free, unknown, cell = self.cells()
+        for name, points, color in (("free", free, FREE_COLOR), ("unknown", unknown, UNKNOWN_COLOR)):
+            if len(points):
+                draw_points(nodes, f"{folder}/{name}", points, color, 0.6 * cell)
+        area = cell * cell
+        return f"a level cut {self.above:g} m above the ground" + swatches(
+            [
+                (FREE_COLOR, "free", f"{len(free) * area:,.0f} m²"),
+                (UNKNOWN_COLOR, "unknown", f"{len(unknown) * area:,.0f} m²"),
+            ]
+        )
+
+    def cells(self) -> tuple[Float64[np.ndarray, "f 3"], Float64[np.ndarray, "u 3"], float]:
+        """Return the middles of free and of unknown cells, and their edge, metres; cells with a voxel are neither."""
+        voxels = self.scene.voxels
+        factor = voxels.free.factor
+        while np.prod(np.ptp(voxels.keys[:, :2], axis=0).astype(float) / factor + 1) > _MOST_POINTS:
+            factor *= 2
+        cell = voxels.voxel_size * factor
+        z = float(np.percentile(voxels.centers[:, 2], 10)) + self.above
+        layer = int(np.floor(z / voxels.voxel_size))
+        low, high = voxels.keys[:, :2].min(axis=0) // factor, voxels.keys[:, :2].max(axis=0) // factor
+        x, y = (np.arange(a, b + 1) for a, b in zip(low, high, strict=True))
+        flat = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+        middle = np.column_stack([flat * factor + factor // 2, np.full(len(flat), layer)]).astype(np.int32)
+        here = np.abs(voxels.keys[:, 2] - layer) <= factor // 2
+        occupied = np.unique(
+            pack(np.column_stack([voxels.keys[here, :2] // factor, np.zeros(here.sum())]).astype(np.int32))
+        )
+        held = np.isin(pack(np.column_stack([flat, np.zeros(len(flat))]).astype(np.int32)), occupied)
+        free = voxels.free.count(middle) > 0
+        points = np.column_stack([(flat + 0.5) * cell, np.full(len(flat), z)])
+        return points[free & ~held], points[~free & ~held], cell
 
 
-def draw_hits(
-    nodes: "viser.SceneApi", objects: Sequence[SceneObject], captions: Sequence[str], margin: float
-) -> "list[viser.SceneNodeHandle]":
-    """Add a box `margin` metres around each object and a caption above the first ones; return the nodes."""
-    if not objects:
-        return []
-    edges = np.concatenate([box_edges(item.box, margin) for item in objects])
-    drawn: list[viser.SceneNodeHandle] = [
-        nodes.add_line_segments("/hits/edges", edges, HIT_COLOR, thickness=3.0, thickness_units="screen")
-    ]
-    for rank, (item, caption) in enumerate(zip(objects, captions, strict=False), start=1):
-        top = item.center + np.array([0.0, 0.0, item.box.size[2] / 2 + 0.4])
-        drawn.append(nodes.add_label(f"/hits/label_{rank}", caption, position=top, anchor="bottom-center"))
-    return drawn
+@dataclass(frozen=True, eq=False)
+class ChangesLayer:
+    """What differs from an earlier map of the same place."""
+
+    scene: SceneMap
+    earlier: SceneMap
+    name: str = "changes"
+    shown: bool = True
+
+    def draw(self, nodes: "viser.SceneApi", folder: str) -> str:
+        """Draw voxels and boxes of what appeared, vanished or changed, where both maps looked."""
+        voxels = diff(self.earlier, self.scene)
+        objects = diff_objects(self.earlier, self.scene)
+        size = self.scene.voxels.voxel_size
+        rows = [
+            ("appeared", self.scene.voxels.centers[voxels.appeared], APPEARED_COLOR, objects.appeared),
+            ("vanished", self.earlier.voxels.centers[voxels.vanished], VANISHED_COLOR, objects.gone),
+            ("changed", self.scene.voxels.centers[voxels.changed], CHANGED_COLOR, tuple(b for _, b in objects.moved)),
+        ]
+        for name, points, color, items in rows:
+            if len(points):
+                draw_points(nodes, f"{folder}/{name}", points, color, 1.15 * size)
+            _draw_edges(nodes, f"{folder}/{name}_boxes", items, color, 0.75 * size)
+        looked = len(voxels.not_observed_in_a) + len(voxels.not_observed_in_b)
+        return (
+            swatches(
+                (color, f"{name}: {len(items)} object{'s' * (len(items) != 1)}", f"{len(points):,} voxels")
+                for name, points, color, items in rows
+            )
+            + f"{looked:,} voxels where one map did not look are not shown"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class TileMapLayer:
+    """The global map that a fleet wrote, as far as it lies within or around the scene."""
+
+    tiles: TileMap
+    around: float = 60.0
+    """Metres beyond the scene."""
+    scene: SceneMap | None = None
+    name: str = "global map"
+    shown: bool = False
+
+    def draw(self, nodes: "viser.SceneApi", folder: str) -> str:
+        """Draw the surface of what is occupied, by class."""
+        points, labels, names = self.surface()
+        colors = label_colors(names)
+        if len(points):
+            draw_points(nodes, f"{folder}/surface", points, colors[labels], self.tiles.schema.cell)
+        counts = np.bincount(labels, minlength=len(names))
+        return swatches((colors[i].tolist(), names[i], f"{counts[i]:,}") for i in np.argsort(-counts)[:8] if counts[i])
+
+    def surface(self) -> tuple[Float64[np.ndarray, "n 3"], np.ndarray, tuple[str, ...]]:
+        """Return middles of occupied voxels with a free or unknown neighbour, their classes, and the classes' names."""
+        from openvocab_occ.memory.merge import surface
+
+        found = surface(self.tiles)
+        keep = np.ones(len(found.points), dtype=bool)
+        if self.scene is not None and len(self.scene.voxels):
+            centers = self.scene.voxels.centers
+            low, high = centers.min(axis=0) - self.around, centers.max(axis=0) + self.around
+            keep = ((found.points >= low) & (found.points <= high)).all(axis=1)
+        at = np.flatnonzero(keep)
+        at = at[:: max(1, -(-len(at) // _MOST_POINTS))]
+        return found.points[at], np.asarray(found.labels)[at].astype(np.int64), tuple(self.tiles.schema.class_names)
+
+
+def _draw_edges(
+    nodes: "viser.SceneApi", name: str, items: tuple[SceneObject, ...], color: tuple[int, int, int], margin: float
+) -> None:
+    if items:
+        edges = np.concatenate([box_edges(item.box, margin) for item in items])
+        nodes.add_line_segments(name, edges, color, thickness=3.0, thickness_units="screen")

@@ -2,49 +2,70 @@
 
 import contextlib
 import threading
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from openvocab_occ.datasets.frame import Frame
 from openvocab_occ.errors import OpenVocabOccError
-from openvocab_occ.export.render import overview
 from openvocab_occ.io.files import PathLike
 from openvocab_occ.objects.scene_map import SceneMap
-from openvocab_occ.query.find import find
+from openvocab_occ.query.find import find, score_voxels
 from openvocab_occ.segmentation.encoder import PixelEncoder
-from openvocab_occ.viewer.guard import guarded_server, stop
-from openvocab_occ.viewer.layers import draw_map, draw_path, tile_voxels, voxel_colors
-from openvocab_occ.viewer.panels import Panel
+from openvocab_occ.viewer.content import Content
+from openvocab_occ.viewer.guard import Door, guarded_server, stop
+from openvocab_occ.viewer.layer_panel import theme
+from openvocab_occ.viewer.layers import GridLayer, Layer, PathLayer, SliceLayer
+from openvocab_occ.viewer.session import FOV, Session
+from openvocab_occ.viewer.shelf import Shelf
+from openvocab_occ.viewer.tiles import BUDGET
 
 if TYPE_CHECKING:
     import viser
 
-_FOV = 1.0  # radians, vertical
-_PANEL_WIDTH = 370
+_PANEL_WIDTH = 300  # pixels
 
 
 class Viewer:
     """A map being served; close it, or use it as a context."""
 
-    def __init__(self, server: "viser.ViserServer", scene: SceneMap, encoder: PixelEncoder | None) -> None:
+    def __init__(
+        self,
+        server: "viser.ViserServer",
+        shelf: Shelf,
+        layers: Sequence[Layer] = (),
+        *,
+        token: str | None = None,
+        budget: int = BUDGET,
+    ) -> None:
+        """Begin to serve; `budget` is how many points a browser is sent at most, what is far being coarser."""
         self.server = server
-        self.scene = scene
-        self.panels: dict[int, Panel] = {}
-        """Panel of each browser that is connected, by viser's client id."""
+        self.sessions: dict[int, Session] = {}
+        """Page of each browser that is connected, by viser's client id."""
+        self.shelf = shelf
+        self._extra = list(layers)
+        self._token = token
+        self._budget = budget
         self._closed = threading.Event()
-        self._tiles = tile_voxels(scene.voxels.centers)
-        self._mode = "image" if len(scene.voxels) and scene.voxels.colors.any() else "semantic"
-        self._draw()
+        self._changing = threading.Lock()
+        theme(server.gui)
+        server.gui.main_panel.dock_left()
+        server.gui.main_panel.set_width(_PANEL_WIDTH)
+        server.scene.configure_environment_map(hdri=None)
+        server.scene.world_axes.visible = False
+        position, target = shelf.first.overview(1.0, FOV)
+        server.initial_camera.position = position
+        server.initial_camera.look_at = target
+        server.initial_camera.fov = FOV
+        server.on_client_connect(self._enter)
+        server.on_client_disconnect(self._leave)
+        threading.Thread(target=_warm_up, args=(shelf.first,), daemon=True).start()
 
-        def enter(client: "viser.ClientHandle") -> None:
-            self.panels[client.client_id] = Panel(client, scene, self._tiles, encoder, self._mode)
-
-        def leave(client: "viser.ClientHandle") -> None:
-            self.panels.pop(client.client_id, None)
-
-        server.on_client_connect(enter)
-        threading.Thread(target=_warm_up, args=(scene, encoder), daemon=True).start()
-        server.on_client_disconnect(leave)
+    @property
+    def scene(self) -> SceneMap:
+        """The map that is shown."""
+        return self.shelf.first.scene
 
     @property
     def port(self) -> int:
@@ -56,6 +77,31 @@ class Viewer:
         """Address of the page."""
         host = self.server.get_host()
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
+
+    @property
+    def invitation(self) -> str:
+        """Address of the page for a visitor: with the token, where one is asked for."""
+        return f"{self.url}/?token={self._token}" if self._token else self.url
+
+    def show(self, scene: SceneMap) -> None:
+        """Show another state of the map in every browser that shows it; cameras stay, queries are asked again.
+
+        Raises MapError for an empty map; the one before stays.
+        """
+        with self._changing:
+            old = self.shelf.first
+            content = self.shelf.replace(old, scene)
+            sessions = [session for session in self.sessions.values() if session.content is old]
+        for session in sessions:
+            session.change(content)
+
+    def add_layer(self, layer: Layer) -> None:
+        """Offer one more layer; browsers that are connected see it too."""
+        with self._changing:
+            self._extra.append(layer)
+            sessions = list(self.sessions.values())
+        for session in sessions:
+            session.layers.replace()
 
     def wait(self) -> None:
         """Serve until `close` or Ctrl-C."""
@@ -71,6 +117,8 @@ class Viewer:
         """Stop serving; a second call does nothing."""
         if not self._closed.is_set():
             self._closed.set()
+            for session in list(self.sessions.values()):
+                session.close()
             stop(self.server)
 
     def __enter__(self) -> "Viewer":
@@ -79,55 +127,61 @@ class Viewer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _draw(self) -> None:
-        server, scene = self.server, self.scene
-        server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(20, 110, 160))
-        server.gui.main_panel.dock_left()
-        server.gui.main_panel.set_width(_PANEL_WIDTH)
-        server.scene.configure_environment_map(hdri=None)
-        server.scene.world_axes.visible = False
-        position, target = overview(scene, fov=_FOV)
-        server.initial_camera.position = position
-        server.initial_camera.look_at = target
-        server.initial_camera.fov = _FOV
-        with server.atomic():
-            colors = voxel_colors(scene, self._mode)
-            draw_map(server.scene, self._tiles, colors, scene.voxels.voxel_size)
-            draw_path(server.scene, np.array([frame.T_world_ego[:3, 3] for frame in scene.frames]).reshape(-1, 3))
+    def _enter(self, client: "viser.ClientHandle") -> None:
+        with self._changing:
+            self.sessions[client.client_id] = Session(client, self.shelf, self.layers, self._budget)
+
+    def _leave(self, client: "viser.ClientHandle") -> None:
+        session = self.sessions.pop(client.client_id, None)
+        if session is not None:
+            session.close()
+
+    def layers(self, content: Content) -> list[Layer]:
+        """Return what can be shown beside the voxels of a map."""
+        layers: list[Layer] = [PathLayer(content.path), GridLayer(content.scene), SliceLayer(content.scene)]
+        return [*layers, *self._extra]
 
 
-def _warm_up(scene: SceneMap, encoder: PixelEncoder | None) -> None:
+def _warm_up(content: Content) -> None:
     """Load what the first query needs, seconds of imports, before a person asks it."""
     with contextlib.suppress(OpenVocabOccError):  # the query itself will say so
-        find(scene, "object", encoder)
+        find(content.scene, "parked car near the road", content.encoder)
+        score_voxels(content.scene, "car", content.encoder)
+    ray = np.array([0.0, 0.0, -1.0])
+    content.picker.pick(content.scene.voxels.centers[0] + [0.0, 0.0, 100.0], ray)
 
 
 def view(
     scene: SceneMap | PathLike,
     encoder: PixelEncoder | None = None,
     *,
+    sequence: Sequence[Frame] | None = None,
+    layers: Sequence[Layer] = (),
     host: str = "127.0.0.1",
     port: int = 8080,
+    token: str | None = None,
     block: bool = True,
 ) -> Viewer:
     """Serve a page that shows the map, takes queries and marks what answers them.
 
     Args:
-        scene: A map, or the path of a saved one.
+        scene: A map, the path of a saved one, or a folder of them to choose from on the page.
         encoder: Turns queries into vectors; a map made by a model with labels needs none.
-        host: This machine by any of its own names. The page has no password, so other hosts are refused.
+        sequence: The frames the map was built from, for their images; a map has none.
+        layers: More to show, such as `layers.ChangesLayer` or `layers.TileMapLayer`.
+        host: An address of this machine. Others than its own need a token.
         port: 0 takes any free one.
+        token: A word that visitors must have: it is in the page's address. Without one only this machine is served.
         block: Serve until Ctrl-C; else return at once, and the viewer lives until `close` or the end of the program.
 
     Raises:
-        ConfigError: The port is taken, or the host is not this machine.
+        ConfigError: The port is taken, or the host is not this machine and there is no token.
         MapError: The map is empty.
     """
-    opened = scene if isinstance(scene, SceneMap) else SceneMap.open(scene)
-    overview(opened)  # an empty map is told before a port is opened
-    server = guarded_server(host, port, "openvocab_occ")
+    shelf = Shelf(scene, encoder, sequence)  # what is wrong with a map is told before a port is opened
+    server = guarded_server(host, port, "openvocab_occ", Door(token))
     try:
-        viewer = Viewer(server, opened, encoder)
+        viewer = Viewer(server, shelf, layers, token=token)
     except BaseException:
         stop(server)
         raise

@@ -1,9 +1,14 @@
 """The server as other programs meet it: no browser here."""
 
 import dataclasses
+import io
+import json
 import socket
+import threading
+import time
 import urllib.error
 import urllib.request
+import zipfile
 
 import numpy as np
 import pytest
@@ -13,7 +18,22 @@ from openvocab_occ.mapping import VoxelMap
 from openvocab_occ.objects import ObjectTree
 from openvocab_occ.query.find import find
 from openvocab_occ.viewer import view
-from openvocab_occ.viewer.panels import answer_line, distance_to_path, escape, hit_table, provenance_line
+from openvocab_occ.viewer.downloads import FORMATS, converted
+from openvocab_occ.viewer.export_panel import file_stem, readable_views
+from openvocab_occ.viewer.live import Follower
+from openvocab_occ.viewer.markup import (
+    answer_line,
+    distance_to_path,
+    escape,
+    escape_markdown,
+    facts,
+    hit_table,
+    preformatted,
+    provenance_line,
+    swatches,
+)  # fmt: skip
+from openvocab_occ.viewer.shelf import Shelf
+from openvocab_occ.viewer.work import Lane
 
 
 @pytest.fixture(scope="module")
@@ -97,37 +117,190 @@ def test_a_saved_map_is_opened_and_its_port_is_free_again_when_closed(street, tm
 
 def test_letters_that_could_be_markup_are_written_by_number():
     hostile = "<img src=x onerror=alert(1)>\n# [a](b) |`*_{}~&amp;"
-    text = escape(hostile)
+    text = escape_markdown(hostile)
     assert not set(text) & set("<>[]()|`*_{}~\"'\n=!")
     assert text.replace("&#", "").count("&") == 0
     import html
 
     assert html.unescape(text) == " ".join(hostile.split())
-    assert escape("pick-up Straße 2") == "pick&#45;up Straße 2"
+    assert escape_markdown("pick-up Straße 2") == "pick&#45;up Straße 2"
 
 
 def test_answers_in_one_line(street):
-    assert answer_line(find(street, "truck")).startswith("**2 objects**, ")
+    assert answer_line(find(street, "truck")).startswith("<b>2 objects</b>, ")
     assert "threshold 0.50" in answer_line(find(street, "truck"))
-    assert "absent:** best 0.8" in answer_line(find(street, "truck", threshold=0.99))
+    assert "absent:</b> best 0.8" in answer_line(find(street, "truck", threshold=0.99))
     assert answer_line(find(street, "shiny car")).endswith("not understood: shiny")
-    assert answer_line(find(street, "unicorn")).startswith("**not understood:** unicorn")
+    assert answer_line(find(street, "unicorn")).startswith("<b>not understood:</b> unicorn")
 
 
 def test_the_list_ranks_and_measures(street):
     hits = list(find(street, "car").hits)
-    rows = hit_table(street, hits).splitlines()[2:]
+    rows = hit_table(street, hits).split("<tr>")[1:]
     assert len(rows) == 2
     for row, hit in zip(rows, hits, strict=True):
         path = [frame.T_world_ego[:3, 3] for frame in street.frames]
         away = min(float(np.linalg.norm(point - hit.object.center)) for point in path)
         assert distance_to_path(street, hit.object) == pytest.approx(away)
-        assert f"car&nbsp;#{hit.object.id}" in row
-        assert f"| {away:.0f}&nbsp;m |" in row
+        assert f">#{hit.object.id}<" in row
+        assert f">{away:.0f}&nbsp;m<" in row
+        assert f">{hit.score:.2f}<" in row
     assert "and 17 more" in hit_table(street, hits[:1] * 25)
 
 
 def test_synthetic_maps_say_so(street):
-    assert provenance_line(street).startswith("**Synthetic input.**")
+    assert provenance_line(street).startswith("<b>Synthetic input.</b>")
     made = dataclasses.replace(street.provenance, synthetic=False, name="<b>")
-    assert provenance_line(dataclasses.replace(street, provenance=made)).startswith("boxes, &#60;b&#62;, ")
+    assert provenance_line(dataclasses.replace(street, provenance=made)).startswith("boxes, &lt;b&gt;, ")
+
+
+HOSTILE = "<img src=x onerror='alert(1)'>"
+
+
+def test_no_helper_lets_markup_through(street):
+    item = next(item for item in street.objects if item.label == "truck")
+    named = dataclasses.replace(item, label=HOSTILE, state=HOSTILE)
+    hit = dataclasses.replace(find(street, "truck").hits[0], object=named)
+    for text in (
+        escape(HOSTILE), preformatted(HOSTILE), facts([(HOSTILE, HOSTILE)]), hit_table(street, [hit]),
+        swatches([((1, 2, 3), HOSTILE, HOSTILE)]),
+        answer_line(dataclasses.replace(find(street, "car"), unknown=(HOSTILE,))),
+    ):  # fmt: skip
+        assert "<img" not in text
+        assert "&lt;img" in text
+        assert "='alert" not in text
+
+
+def test_a_place_that_nobody_saw_is_told(street):
+    answer = dataclasses.replace(find(street, "truck"), hits=(), verdict="unobserved", region_seen=0.04)
+    assert answer_line(answer).startswith("<b>not observed there</b>: 4% of that place was seen")
+
+
+def test_a_token_opens_the_door_to_the_page(street):
+    token = "open-sesame-0123456789"
+    with view(street, host="127.0.0.1", port=0, token=token, block=False) as viewer:
+        assert viewer.invitation == f"{viewer.url}/?token={token}"
+        assert status(viewer) == 403
+        request = urllib.request.Request(viewer.invitation)
+        jar = urllib.request.HTTPCookieProcessor()
+        opener = urllib.request.build_opener(urllib.request.ProxyHandler({}), jar)
+        with opener.open(request, timeout=10) as response:
+            assert response.status == 200
+            assert response.url == viewer.url + "/"  # the token is not left in the address
+        with opener.open(viewer.url, timeout=10) as response:
+            assert response.status == 200
+
+
+def test_a_folder_of_maps_is_a_shelf(street, tmp_path):
+    for name in ("b", "a"):
+        street.save(tmp_path / f"{name}.ovmap")
+    shelf = Shelf(tmp_path)
+    assert shelf.names == ("a", "b")
+    assert shelf.content("a") is shelf.first
+    assert len(shelf.content("b").scene.voxels) == len(street.voxels)
+    (tmp_path / "none").mkdir()
+    with pytest.raises(NotFoundError, match="no map in"):
+        Shelf(tmp_path / "none")
+
+
+def test_a_followed_map_is_shown_anew_when_it_is_written_again(street, tmp_path):
+    path = street.save(tmp_path / "street.ovmap")
+    with view(path, port=0, block=False) as viewer, Follower(viewer, path, every=0.05):
+        first = viewer.scene
+        smaller = dataclasses.replace(street, voxels=street.voxels.subset(np.arange(len(street.voxels)) % 2 == 0))
+        tree = ObjectTree([dataclasses.replace(street.objects.root, children=())])
+        dataclasses.replace(smaller, objects=tree).save(path)
+        wait_for(lambda: viewer.scene is not first)
+        assert len(viewer.scene.voxels) == len(smaller.voxels)
+        assert len(viewer.scene.objects) == 0
+
+
+def wait_for(met, seconds=30):
+    end = time.monotonic() + seconds
+    while not met():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.01)
+
+
+def test_a_map_is_shown_while_it_is_built():
+    from openvocab_occ.datasets.registry import load_sequence
+    from openvocab_occ.pipeline.build import MapBuilder
+    from openvocab_occ.segmentation.demo_models import street_model
+    from openvocab_occ.segmentation.onnx import load_encoder
+    from openvocab_occ.viewer.live import view_build
+
+    encoder = load_encoder(street_model())
+    sequence = load_sequence("street", frames=2)
+    seen = []
+    viewer = view_build(
+        sequence, encoder, MapBuilder(encoder), port=0, every=0.0, started=lambda v: seen.append(len(v.scene.frames))
+    )
+    with viewer:
+        assert seen == [1]
+        assert len(viewer.scene.frames) == 2
+
+
+def test_of_waiting_work_only_the_latest_is_done():
+    done, errors, busy = [], [], []
+    started, release = threading.Event(), threading.Event()
+    lane = Lane(errors.append, busy.append)
+
+    def first(current):
+        started.set()
+        release.wait(10)
+        done.append(("first", current()))
+
+    lane.put(first)
+    assert started.wait(10)
+    assert not lane.idle()
+    for name in ("second", "third", "fourth"):
+        lane.put(lambda current, name=name: done.append((name, current())))
+    release.set()
+    wait_for(lane.idle)
+    assert done == [("first", False), ("fourth", True)]
+    lane.put(lambda _current: 1 / 0)
+    wait_for(lambda: errors and lane.idle())
+    assert isinstance(errors[0], ZeroDivisionError)
+    lane.put(lambda current: done.append(("after", current())))
+    wait_for(lambda: ("after", True) in done)
+    wait_for(lane.idle)
+    assert busy[-1] is False
+    lane.close()
+    lane.put(lambda _current: done.append("closed"))
+    assert "closed" not in done
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_a_selection_leaves_in_every_format(street, format):
+    chosen = np.zeros(len(street.voxels), bool)
+    truck = next(item for item in street.objects if item.label == "truck")
+    chosen[truck.voxels] = True
+    name, content = converted(street, chosen, format, "truck")
+    assert name.startswith("truck.")
+    assert len(content) > 100
+    if format == ".ply":
+        assert f"element vertex {chosen.sum()}".encode() in content
+    if format == ".ovmap":
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            assert {"truck.ovmap/manifest.json", "truck.ovmap/voxels.parquet"} <= set(archive.namelist())
+
+
+def test_nothing_selected_is_told(street):
+    with pytest.raises(ConfigError, match="nothing is selected"):
+        converted(street, np.zeros(len(street.voxels), bool), ".ply", "x")
+
+
+def test_file_names_are_tame():
+    assert file_stem("../../etc/passwd") == "etc_passwd"
+    assert file_stem("städt <b>") == "st_dt_b"
+    assert file_stem("...") == "map"
+
+
+def test_damaged_saved_views_are_left_out():
+    good = {"position": [1, 2, 3], "look_at": [0, 0, 0], "fov": 1, "query": "car", "selected": None, "mode": "rgb",
+            "frame": 2}  # fmt: skip
+    bad = [dict(good, position=[1, 2]), dict(good, look_at=[0, 0, float("nan")]), dict(good, frame="x"), 7, {}]
+    text = json.dumps({"good": good, **{f"bad {i}": one for i, one in enumerate(bad)}})
+    assert list(readable_views(text)) == ["good"]
+    assert readable_views("{") == {}
+    assert readable_views("[1]") == {}
