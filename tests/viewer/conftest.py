@@ -38,6 +38,8 @@ class Tab:
         self.page.add_init_script("window.hurt = 0; window.xss = () => { window.hurt += 1 }")
         before = set(viewer.sessions)
         self.page.goto(viewer.url + "/?fixedDpr=1")
+        # viser tells of software graphics some seconds late, over the scene, where it takes the clicks
+        self.page.add_style_tag(content="[class*=Notification] { pointer-events: none !important }")
         self.until(lambda: set(viewer.sessions) - before)
         (mine,) = set(viewer.sessions) - before
         self.session = viewer.sessions[mine]

@@ -206,7 +206,7 @@ def test_distances_and_regions_are_taken_by_the_pointer(open_tab, boxes, street)
     tab.mounted("/layers/0/line")
     tab.page.wait_for_timeout(500)  # the page listens to the pointer only when it is told to
     tab.click(tab.pixel_of(trucks[0]), "Shift")
-    tab.mounted("/measure/start")
+    tab.until(lambda: tab.session.tools._first is not None)
     tab.click(tab.pixel_of(trucks[1]), "Shift")
     tab.until(lambda: tab.session.tools.measured is not None)
     between = np.linalg.norm(trucks[0].center - trucks[1].center)
