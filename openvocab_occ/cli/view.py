@@ -55,7 +55,8 @@ def view(
     if earlier and isinstance(shown, SceneMap):
         layers.append(ChangesLayer(shown, SceneMap.open(earlier)))
     if tiles and isinstance(shown, SceneMap):
-        layers.append(TileMapLayer(TileMap.open(str(tiles), writable=False), scene=shown))
+        city = TileMap.open(str(tiles), writable=False)
+        layers += [TileMapLayer(city, scene=shown, by="agent"), TileMapLayer(city, scene=shown, by="class")]
     running = server.view(
         shown,
         load_encoder(encoder, card) if encoder else None,

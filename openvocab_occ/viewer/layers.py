@@ -1,10 +1,10 @@
 """What can be shown beside the voxels of a map; the list is open: anything with a name that can draw itself."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from openvocab_occ.export.palette import label_colors
 from openvocab_occ.mapping.keys import pack
@@ -170,20 +170,26 @@ class TileMapLayer:
     around: float = 60.0
     """Metres beyond the scene."""
     scene: SceneMap | None = None
-    name: str = "global map"
+    by: Literal["agent", "class"] = "agent"
+    """What colours tell: who saw a voxel last, or what it is."""
     shown: bool = False
 
+    @property
+    def name(self) -> str:
+        """What the switch says."""
+        return f"global map by {self.by}"
+
     def draw(self, nodes: "viser.SceneApi", folder: str) -> str:
-        """Draw the surface of what is occupied, by class."""
-        points, labels, names = self.surface()
+        """Draw what is occupied."""
+        points, numbers, names = self.surface()
         colors = label_colors(names)
         if len(points):
-            draw_points(nodes, f"{folder}/surface", points, colors[labels], self.tiles.schema.cell)
-        counts = np.bincount(labels, minlength=len(names))
+            draw_points(nodes, f"{folder}/surface", points, colors[numbers], self.tiles.schema.cell)
+        counts = np.bincount(numbers, minlength=len(names))
         return swatches((colors[i].tolist(), names[i], f"{counts[i]:,}") for i in np.argsort(-counts)[:8] if counts[i])
 
-    def surface(self) -> tuple[Float64[np.ndarray, "n 3"], np.ndarray, tuple[str, ...]]:
-        """Return middles of occupied voxels with a free or unknown neighbour, their classes, and the classes' names."""
+    def surface(self) -> tuple[Float64[np.ndarray, "n 3"], Int64[np.ndarray, " n"], tuple[str, ...]]:
+        """Return middles of occupied voxels, the number of the agent or class of each, and their names."""
         from openvocab_occ.memory.merge import surface
 
         found = surface(self.tiles)
@@ -194,7 +200,9 @@ class TileMapLayer:
             keep = ((found.points >= low) & (found.points <= high)).all(axis=1)
         at = np.flatnonzero(keep)
         at = at[:: max(1, -(-len(at) // _MOST_POINTS))]
-        return found.points[at], np.asarray(found.labels)[at].astype(np.int64), tuple(self.tiles.schema.class_names)
+        if self.by == "agent":
+            return found.points[at], found.agents[at], found.agent_names
+        return found.points[at], found.labels[at], tuple(self.tiles.schema.class_names)
 
 
 def _draw_edges(

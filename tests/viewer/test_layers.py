@@ -1,5 +1,6 @@
 """The map as nodes: tiles and their levels, colours, picking, layers."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,10 +12,12 @@ from openvocab_occ.errors import ConfigError
 from openvocab_occ.export.palette import NOTHING, UNLABELLED, label_colors, paint_labels, paint_numbers
 from openvocab_occ.mapping import Lifted, VoxelMap
 from openvocab_occ.objects.box import Box
+from openvocab_occ.pipeline.combine import only
+from openvocab_occ.pipeline.compare import diff
 from openvocab_occ.viewer.colors import COLOR_MODES, grey_but, object_colors, paint_voxels, uncertainty
 from openvocab_occ.viewer.content import Content
 from openvocab_occ.viewer.drawing import box_edges
-from openvocab_occ.viewer.layers import ChangesLayer, GridLayer, Layer, PathLayer, SliceLayer
+from openvocab_occ.viewer.layers import ChangesLayer, GridLayer, Layer, PathLayer, SliceLayer, TileMapLayer
 from openvocab_occ.viewer.picking import Picker
 from openvocab_occ.viewer.points import Eye, Points
 from openvocab_occ.viewer.tiles import LEVELS, choose_levels, distances, tile_bounds, tile_voxels
@@ -290,3 +293,59 @@ def test_layers_are_layers(street):
     made = [PathLayer(content.path), GridLayer(street), SliceLayer(street), ChangesLayer(street, street)]
     assert all(isinstance(layer, Layer) for layer in made)
     assert len({layer.name for layer in made}) == len(made)
+
+
+@pytest.fixture
+def page():
+    """A page to draw on, with no browser there."""
+    import viser
+
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield server.scene
+    server.stop()
+
+
+def drawn(page, name):
+    return page._handle_from_node_name[name]
+
+
+def test_the_global_map_is_drawn_by_agent_and_by_class(street, page, tmp_path):
+    from openvocab_occ.geometry import GridSpec
+    from openvocab_occ.memory import TileMap
+
+    city = TileMap.create(tmp_path / "city.tiles", ("wall", "tree", "free"), heights=8)
+    spec = GridSpec((0.0, 0.0, -1.0), 0.4, (8, 8, 8))
+    logits = np.full((8, 8, 8, 3), -9.0, np.float32)
+    logits[..., 2], logits[:, :, 0, 0], logits[:, :, 1, 1] = 0.0, 9.0, 9.0
+    for agent, half in (("car-1", np.s_[:4]), ("car-<2>", np.s_[4:])):
+        mask = np.zeros((8, 8, 8), bool)
+        mask[half] = True
+        city.write(logits, mask, np.eye(4), spec, stamp=1.0, agent=agent, log=agent)
+    for by, names in (("agent", ("car-1", "car-<2>")), ("class", ("wall", "tree"))):
+        layer = TileMapLayer(city, by=by)
+        assert isinstance(layer, Layer)
+        legend = layer.draw(page, f"/{by}")
+        points, numbers, _ = layer.surface()
+        assert len(points) == 128
+        assert np.bincount(numbers).tolist()[:2] == [64, 64]
+        assert len(drawn(page, f"/{by}/surface").points) == 128
+        assert all(name.replace("<", "&lt;").replace(">", "&gt;") in legend for name in names)
+    far = TileMapLayer(city, around=5.0, scene=replace(street, voxels=voxels_of([[500, 500, 0]])))
+    assert len(far.surface()[0]) == 0
+
+
+def test_changes_are_drawn_where_both_looked(street, page):
+    """A thing taken out of the second map has vanished, and the other way round it has appeared."""
+    truck = next(item for item in street.objects if item.label == "truck" and item.level == "object")
+    keep = ~np.isin(np.arange(len(street.voxels)), truck.voxels)
+    without = only(street, keep)
+    blocks = np.unique(np.floor(street.voxels.centers[truck.voxels] / (8 * without.voxels.free.cell)), axis=0)
+    without.voxels.free._add(blocks.astype(np.int32), np.full((len(blocks), 512), 9, np.uint8))  # looked through there
+    legend = ChangesLayer(without, street).draw(page, "/gone")
+    assert "vanished: 1 object<" in legend
+    gone = diff(street, without).vanished
+    assert len(gone) > 0.7 * len(truck.voxels)
+    assert len(drawn(page, "/gone/vanished").points) == len(gone)
+    legend = ChangesLayer(street, without).draw(page, "/came")
+    assert "appeared: 1 object<" in legend
+    assert ChangesLayer(street, street).draw(page, "/same").count("0 objects") == 3
