@@ -195,8 +195,10 @@ def server(tools: MapTools) -> "MCPServer":
 def described(made: "MCPServer") -> list[dict[str, Any]]:
     """Return name, text and JSON Schema of the arguments of each tool."""
     import asyncio
+    from concurrent.futures import ThreadPoolExecutor
 
-    tools = asyncio.run(made.list_tools())
+    with ThreadPoolExecutor(1) as pool:  # a notebook has a loop running in its own thread
+        tools = pool.submit(lambda: asyncio.run(made.list_tools())).result()
     return [{"name": t.name, "description": t.description, "arguments": t.input_schema} for t in tools]
 
 

@@ -4,6 +4,7 @@ import asyncio
 import base64
 import json
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -33,7 +34,8 @@ def ask(served, *calls):
             listed = await client.list_tools()
             return [tool.name for tool in listed.tools], [await client.call_tool(n, a) for n, a in calls]
 
-    return asyncio.run(run())
+    with ThreadPoolExecutor(1) as pool:  # browser tests leave a loop running in this thread
+        return pool.submit(lambda: asyncio.run(run())).result()
 
 
 def test_the_client_lists_and_calls_the_tools(tools):
