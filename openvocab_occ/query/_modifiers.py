@@ -1,5 +1,6 @@
 """What follows a noun: relations, distances, attributes, clauses."""
 
+from abc import abstractmethod
 from dataclasses import replace
 
 from openvocab_occ.query import algebra as q
@@ -13,9 +14,9 @@ from openvocab_occ.query.algebra import Node
 class Modifiers(Tokens):
     """The rules for modifiers; `phrase` reads the noun phrase of an anchor."""
 
+    @abstractmethod
     def phrase(self, *, anchor: bool = False) -> Phrase | None:
         """Read a noun phrase."""
-        raise NotImplementedError
 
     def _modifiers(self, phrase: Phrase) -> Phrase:
         """Read what follows a noun."""

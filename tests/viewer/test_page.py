@@ -123,6 +123,7 @@ def test_time_is_scrubbed_and_cameras_are_looked_through(open_tab, drive):
     time_panel.look_through()
     camera = time_panel.looked_through
     tab.until(lambda: np.abs(tab.session.client.camera.position - camera.position).max() < 1e-3)
+    tab.settle()
     own = tab.session.camera(64, 36).T_world_cam
     np.testing.assert_allclose(own[:3, 2], camera.T_world_cam[:3, 2], atol=1e-3)
     tab.settle()
@@ -221,6 +222,7 @@ def test_distances_and_regions_are_taken_by_the_pointer(open_tab, boxes, street)
     tab.page.mouse.up()
     tab.page.keyboard.up("Control")
     tab.until(lambda: tab.session.tools.region is not None)
+    tab.settle()
     low, high = tab.session.tools.region
     assert (low < high).all()
     inside = ((street.voxels.centers >= low) & (street.voxels.centers < high)).all(axis=1)
