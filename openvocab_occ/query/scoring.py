@@ -170,7 +170,7 @@ class Scorer:
     def nearness(self, vector: Float32[np.ndarray, " c"], neutral: float) -> dict[str, float]:
         """Return by how much each class name of the map's occupancy is nearer to a text than `neutral`; only those."""
         known = [name for name in self._class_names if not self._unknown(name)]
-        near = {name: float(self._encode(name) @ vector) - neutral for name in known}
+        near = {name: float(self._unit(self._encode(name)) @ vector) - neutral for name in known}
         return {name: above for name, above in near.items() if above > 0}
 
     def _unit(self, vector: Float32[np.ndarray, " c"]) -> Float32[np.ndarray, " c"]:
