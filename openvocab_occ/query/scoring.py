@@ -5,6 +5,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
@@ -23,6 +24,7 @@ DENSE_THRESHOLD = DEFAULT_THRESHOLD["cosine"]
 LIKE_THRESHOLD = 0.8
 """Cosine of two things that look alike: image features lie closer to each other than to words."""
 _MAX_PIXELS = 1 << 25
+_NAMED: "WeakKeyDictionary[SceneMap, dict[str, np.ndarray]]" = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -95,6 +97,7 @@ class Scorer:
         self.info, self.encoder, self.asked = scene.encoder, encoder, threshold
         self.card: Any = getattr(encoder, "scoring", None)  # optional in the protocol
         self.has_labels = scene.encoder.contract == "logits"
+        self._scene = scene
         self._class_names = () if self.has_labels else scene.class_names
 
     @property
@@ -169,9 +172,15 @@ class Scorer:
 
     def nearness(self, vector: Float32[np.ndarray, " c"], neutral: float) -> dict[str, float]:
         """Return by how much each class name of the map's occupancy is nearer to a text than `neutral`; only those."""
-        known = [name for name in self._class_names if not self._unknown(name)]
-        near = {name: float(self._unit(self._encode(name)) @ vector) - neutral for name in known}
+        near = {name: float(own @ vector) - neutral for name, own in self._named().items()}
         return {name: above for name, above in near.items() if above > 0}
+
+    def _named(self) -> dict[str, Float32[np.ndarray, " c"]]:
+        """Return the vector of each class name that the text model knows, encoded once a map."""
+        if self._scene not in _NAMED:
+            known = [name for name in self._class_names if not self._unknown(name)]
+            _NAMED[self._scene] = {name: self._unit(self._encode(name)) for name in known}
+        return _NAMED[self._scene]
 
     def _unit(self, vector: Float32[np.ndarray, " c"]) -> Float32[np.ndarray, " c"]:
         vector = np.asarray(vector, dtype=np.float32)
