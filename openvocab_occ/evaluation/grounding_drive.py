@@ -5,7 +5,7 @@ enough of is asked for, and what it saw less of may be named or not. A hit is ri
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -51,7 +51,7 @@ class Drive:
     """Things of which enough voxels were observed to be asked for."""
     watched: frozenset[int]
     """Things observed long enough for their state."""
-    others: Mapping[int, str]
+    others: Mapping[int, str] = field(default_factory=dict[int, str])
     """Kinds of the things that no class names."""
 
     def overlap(self) -> Overlap:
