@@ -79,7 +79,7 @@ def _reading(city: TileMap, T: np.ndarray, repeats: int) -> dict[str, Any]:
     files = _window_files(city, T)
     plain = city.store.folder.parent / "plain" if city.store.folder else Path("plain")
     plain.mkdir()
-    size = city.schema.planes * 64 * 64
+    size = city.schema.cell_bytes * 64 * 64
     for file in files:
         (plain / file.name).write_bytes(file.read_bytes()[:-4])  # without the checksum: a plain zstd file
 

@@ -25,11 +25,14 @@ def locate(affine, rows, out):
     found = 0
     for cell in range(out.shape[0]):
         x, y = cell // _SIDE + 0.5, cell % _SIDE + 0.5
+        u = affine[0, 0] * x + affine[0, 1] * y + affine[0, 3] + _SNAP
+        v = affine[1, 0] * x + affine[1, 1] * y + affine[1, 3] + _SNAP
+        w = affine[2, 0] * x + affine[2, 1] * y + affine[2, 3] + _SNAP
         for h in range(out.shape[1]):
             z = h + 0.5
-            i = int(np.floor(affine[0, 0] * x + affine[0, 1] * y + affine[0, 2] * z + affine[0, 3] + _SNAP))
-            j = int(np.floor(affine[1, 0] * x + affine[1, 1] * y + affine[1, 2] * z + affine[1, 3] + _SNAP))
-            k = int(np.floor(affine[2, 0] * x + affine[2, 1] * y + affine[2, 2] * z + affine[2, 3] + _SNAP))
+            i = int(np.floor(u + affine[0, 2] * z))
+            j = int(np.floor(v + affine[1, 2] * z))
+            k = int(np.floor(w + affine[2, 2] * z))
             row = -1
             if 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
                 row = rows[i, j, k]
@@ -112,17 +115,21 @@ def _slot(table, x, y, z, heights):
 def _set(codes, levels, weight, out):
     """Write weight times the logits of a voxel to out; with `levels` they are codes, and centred here."""
     count = out.shape[0]
-    if levels.shape[0] > 0:
-        mean = np.float32(0.0)
-        for c in range(count):
-            out[c] = levels[np.uint8(codes[c])]
-            mean += out[c]
-        mean /= np.float32(count)
-        for c in range(count):
-            out[c] = weight * (out[c] - mean)
-    else:
+    if levels.shape[0] == 0:
         for c in range(count):
             out[c] = weight * np.float32(codes[c])
+        return
+    one, two = np.float32(0.0), np.float32(0.0)  # two sums: each addition waits for the one before
+    for c in range(0, count - 1, 2):
+        out[c], out[c + 1] = levels[np.uint8(codes[c])], levels[np.uint8(codes[c + 1])]
+        one += out[c]
+        two += out[c + 1]
+    if count % 2:
+        out[count - 1] = levels[np.uint8(codes[count - 1])]
+        one += out[count - 1]
+    mean = (one + two) / np.float32(count)
+    for c in range(count):
+        out[c] = weight * (out[c] - mean)
 
 
 @kernel
@@ -155,12 +162,13 @@ def gather(affine, table, values, stamps, levels, fading, bilinear, start, stop,
     _, ny, nz, count = out.shape
     for i in range(start, stop):
         for j in range(ny):
+            x, y = i + 0.5, j + 0.5
+            u0 = affine[0, 0] * x + affine[0, 1] * y + affine[0, 3] + _SNAP
+            v0 = affine[1, 0] * x + affine[1, 1] * y + affine[1, 3] + _SNAP
+            w0 = affine[2, 0] * x + affine[2, 1] * y + affine[2, 3] + _SNAP
             for k in range(nz):
                 row = out[i, j, k]
-                x, y, z = i + 0.5, j + 0.5, k + 0.5
-                u = affine[0, 0] * x + affine[0, 1] * y + affine[0, 2] * z + affine[0, 3] + _SNAP
-                v = affine[1, 0] * x + affine[1, 1] * y + affine[1, 2] * z + affine[1, 3] + _SNAP
-                w = affine[2, 0] * x + affine[2, 1] * y + affine[2, 2] * z + affine[2, 3] + _SNAP
+                u, v, w = u0 + affine[0, 2] * (k + 0.5), v0 + affine[1, 2] * (k + 0.5), w0 + affine[2, 2] * (k + 0.5)
                 iu, iv, iw = int(np.floor(u)), int(np.floor(v)), int(np.floor(w))
                 slot, cell, h = _slot(table, iu, iv, iw, heights)
                 known = slot >= 0 and stamps[slot, cell, h] != 0

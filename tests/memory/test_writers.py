@@ -54,7 +54,7 @@ def test_torn_chunks_are_told_and_made_anew(city, rng):
     whole = chunk.read_bytes()
     for damage in (whole[: len(whole) // 2], b"", bytes([whole[0] ^ 1]) + whole[1:], whole[:-9] + b"\x00" + whole[-8:]):
         chunk.write_bytes(damage)
-        with pytest.raises(MapError, match=r"logs/one/c\.512\.0\.\d+\.\d+ is damaged.*memory verify"):
+        with pytest.raises(MapError, match=r"logs/one/c\.512\.\d+\.\d+\.0 is damaged.*memory verify"):
             city.read(np.eye(4), SPEC)
         with pytest.raises(MapError, match="is damaged"):
             write(city, random_logits(rng), mask, np.eye(4), stamp=0.5)
