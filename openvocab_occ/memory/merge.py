@@ -10,6 +10,7 @@ from openvocab_occ.errors import ConfigError
 from openvocab_occ.memory import journal
 from openvocab_occ.memory.changes import centers
 from openvocab_occ.memory.footprint import tile_rows
+from openvocab_occ.memory.foundation import merge_pruned
 from openvocab_occ.memory.layer import TileKey
 from openvocab_occ.memory.schema import CELLS
 from openvocab_occ.memory.store import agent_number
@@ -79,6 +80,7 @@ def merge_journal(target: TileMap, source: TileMap) -> None:
             target.admit(agent)
         if reason:
             target.quarantine(agent, reason)
+    merge_pruned(target, source)
     for name in journal.names(source.store):
         content = source.store.read(name.key)
         if content is not None:

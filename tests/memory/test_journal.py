@@ -12,8 +12,7 @@ from openvocab_occ.memory.filters import remove_dynamic
 from openvocab_occ.memory.fold import FoldConfig, counts, rebuild
 from openvocab_occ.memory.health import describe, verify
 from openvocab_occ.memory.trust import audit, quarantine_contradicting
-from tests.memory.conftest import NAMES, SPEC, probabilities, random_logits, random_pose
-from tests.memory.test_tile_map import contents, write
+from tests.memory.conftest import NAMES, SPEC, contents, probabilities, random_logits, random_pose, write
 
 ALL = np.ones(SPEC.shape, bool)
 
