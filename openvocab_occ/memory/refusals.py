@@ -53,6 +53,6 @@ def translated(what: str) -> Iterator[None]:
             fix = "check its permissions"
             raise StorageError(f"{what} cannot be written: it is read-only", got=brief, fix=fix) from error
         if any(sign in text for sign in _DAMAGED):
-            fix = "openvocab-occ memory verify lists what is damaged, memory rebuild --repair makes it anew"
+            fix = "openvocab-occ memory verify lists what is damaged, memory verify --repair makes it anew"
             raise MapError(f"{what} is damaged", expected="a whole chunk", got=brief, fix=fix) from error
         raise StorageError(f"{what} cannot be used", got=brief) from error

@@ -173,7 +173,7 @@ class MapSchema:
     def _codes(self, logits: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return what `encode_seen` does, quantised."""
         edges = np.linspace(0, len(mask), 65).astype(np.int64)
-        rows = np.cumsum([0, *(np.count_nonzero(mask[a:b]) for a, b in pairwise(edges))])
+        rows = np.cumsum([0, *(int(np.count_nonzero(mask[a:b])) for a, b in pairwise(edges))])
         flat, codes = np.empty(rows[-1], np.int64), np.empty((rows[-1], self.num_classes), np.uint8)
         bad = np.zeros(64, dtype=np.int64)
 
