@@ -1,9 +1,7 @@
 """One Zarr array of tiles: the base of a map, or what one log laid over it."""
 
 import random
-import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, cast
 
@@ -12,13 +10,13 @@ from openvocab_occ.errors import StorageError
 from openvocab_occ.memory._tiles_kernels import merge_tiles
 from openvocab_occ.memory.chunk import array_metadata, chunk_of, record_of
 from openvocab_occ.memory.commit import Batch
+from openvocab_occ.memory.recent import Recent
 from openvocab_occ.memory.refusals import translated
 from openvocab_occ.memory.schema import ORIGIN, MapSchema, Tile
 from openvocab_occ.memory.store import Store
 
 _ATTEMPTS = 60
 _WAIT = 0.004  # s, doubled up to 64 times for each conflict; a commit takes about ten milliseconds
-_REMEMBERED = 64 * 2**20  # bytes of decoded tiles that the next write is likely to touch again
 
 
 class TileKey(NamedTuple):
@@ -45,14 +43,13 @@ Change = Callable[[TileKey, Tile], int]
 class Layer:
     """Tiles of one array. Reads see whole chunks; an update of a chunk is never lost to another writer."""
 
-    def __init__(self, store: Store, prefix: str, schema: MapSchema) -> None:
+    def __init__(self, store: Store, prefix: str, schema: MapSchema, recent: Recent | None = None) -> None:
         self.prefix = prefix
         self.schema = schema
         self._store = store
         self._where = f"{store.name}/{prefix}".rstrip("/")
         self._kv: Any = cast(Any, store.kv)
-        self._recent: OrderedDict[TileKey, tuple[bytes, Tile]] = OrderedDict()
-        self._lock = threading.Lock()
+        self._recent = recent or Recent()
         if store.read(f"{prefix}zarr.json") is None:
             store.write_json(f"{prefix}zarr.json", array_metadata(schema))
 
@@ -124,8 +121,9 @@ class Layer:
                 if first is not None:
                     first()
                 lost = batch.commit()
-            total += sum(count for key, (_, _, count) in altered.items() if self._name(key) not in lost)
-            self._remember({key: (v, tile) for key, (v, tile, _) in altered.items() if self._name(key) not in lost})
+            done = {name: altered[key] for name, key in wanted.items() if name not in lost}
+            total += sum(count for _, _, count in done.values())
+            self._recent.keep({name: (chunk, tile) for name, (chunk, tile, _) in done.items() if chunk})
             if not lost:
                 return total
             wanted = {name: wanted[name] for name in lost}
@@ -179,20 +177,10 @@ class Layer:
         return done
 
     def _own(self, key: TileKey, value: bytes | None) -> Tile:
-        """Return a stored chunk as a tile that may be altered: as it was left here, if nobody wrote it since."""
-        with self._lock:
-            before = self._recent.pop(key, None)
+        """Return a stored chunk as a tile that may be altered."""
         if value is None:
             return Tile(self.schema)
-        return before[1] if before is not None and before[0] == value else self.tile(key, value).copy()
-
-    def _remember(self, tiles: Mapping[TileKey, tuple[bytes, Tile]]) -> None:
-        """Keep what was committed for the next write."""
-        with self._lock:
-            self._recent.update(tiles)
-            kept = sum(tile.record.nbytes for _, tile in self._recent.values())
-            while kept > _REMEMBERED:
-                kept -= self._recent.popitem(last=False)[1][1].record.nbytes
+        return self._recent.take(self._name(key), value) or self.tile(key, value).copy()
 
     def _name(self, key: TileKey) -> str:
         return f"{self.prefix}{chunk_name(key)}"

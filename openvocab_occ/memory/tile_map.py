@@ -19,6 +19,7 @@ from openvocab_occ.memory.cache import TileCache, merged
 from openvocab_occ.memory.clock import fading_rate, ticks_of
 from openvocab_occ.memory.footprint import tile_rows
 from openvocab_occ.memory.layer import Layer, TileKey
+from openvocab_occ.memory.recent import Recent
 from openvocab_occ.memory.schema import LEVELS, DType, MapSchema, Tile
 from openvocab_occ.memory.store import Location, Store, agent_number, safe_name
 from openvocab_occ.memory.window import Prior, Window
@@ -54,6 +55,7 @@ class TileMap:
         self.schema = schema
         self.writable = writable
         self._layers: dict[str, Layer] = {}
+        self._recent = Recent()
         self._cache = TileCache(schema, cache_bytes)
         self._lock = threading.RLock()
 
@@ -355,7 +357,7 @@ class TileMap:
     def _layer(self, prefix: str) -> Layer:
         with self._lock:
             if prefix not in self._layers:
-                self._layers[prefix] = Layer(self.store, prefix, self.schema)
+                self._layers[prefix] = Layer(self.store, prefix, self.schema, self._recent)
             return self._layers[prefix]
 
 
