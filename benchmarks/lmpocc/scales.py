@@ -35,7 +35,8 @@ REDUCED = Scale(
     memory=TrainConfig(steps=80, batch=4, rate=1e-3, warm_up=10, flip=False),
 )  # fmt: skip
 CORE = Scale(
-    train=CityPlan(cities=tuple(range(100, 116))), test=CityPlan(cities=tuple(range(900, 908))), memory=_MEMORY,
+    train=CityPlan(cities=tuple(range(100, 116))), test=CityPlan(cities=tuple(range(900, 908))),
+    base=TrainConfig(steps=1600, batch=8, save_every=50), memory=_MEMORY,
 )  # fmt: skip
 FULL = Scale(
     networks=("flashocc-tiny", "dhd-tiny"),
