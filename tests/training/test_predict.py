@@ -126,6 +126,23 @@ class TestOnnx:
         assert np.abs(exported.predict(frame, prior) - exported.predict(frame)).max() > 1e-2
         assert exported.spec == network.spec
 
+    @pytest.mark.parametrize("with_memory", [False, True])
+    def test_dhd_too(self, with_memory, tmp_path):
+        """Its deformable convolution and its slabs have standard operators; close calls of heights may differ."""
+        torch.manual_seed(1)
+        network = load_network("dhd-tiny", memory=with_memory)
+        baseline = network.module.baseline if with_memory else network.module
+        torch.nn.init.normal_(baseline._height_net[0].depth_conv[-1].weight, std=0.5)  # heights that differ by pixel
+        exported = OnnxNetwork(export_onnx(network, tmp_path / "d.onnx", cameras=2))
+        frame = drive_frames(1)[0]
+        rng = np.random.default_rng(0)
+        known = rng.random(network.spec.shape) < 0.5
+        logits = rng.normal(0, 3, (*network.spec.shape, 18)).astype(np.float32) * known[..., None]
+        prior = type("P", (), {"logits": logits, "known": known})() if with_memory else None
+        ours, theirs = network.predict(frame, prior), exported.predict(frame, prior)
+        assert (np.abs(ours - theirs) < 1e-3).mean() > 0.999
+        assert ours.std() > 1e-3
+
     def test_runs_with_the_map_as_ours_do(self, pair, tmp_path):
         network, exported = pair
         city = open_map(tmp_path / "c.tiles", network)

@@ -67,15 +67,44 @@ def test_policies_are_their_formulae(policy, rng):
         np.testing.assert_allclose(found.logits[seen & ~again], a[seen & ~again], atol=1e-2)
 
 
-def test_gate_lies_between_keeping_and_replacing(rng):
-    (_, _, first, _), (_, _, second, _) = (next(writes(rng)) for _ in range(2))
-    everything, T = np.ones(SPEC.shape, bool), at(0, 0, 0)
-    found = {}
-    for share in (0.0, 0.25, 1.0):
-        stream = new()
-        stream.write(T, first, everything)
-        stream.write(T, second, everything, policy="gate", gate=np.full(SPEC.shape, share, np.float32))
-        found[share] = stream.read(T).logits
-    np.testing.assert_allclose(found[0.25], 0.75 * found[0.0] + 0.25 * found[1.0], atol=1e-2)
+@pytest.mark.parametrize(("policy", "shares"), [("newest", (0, 1)), ("ema", (0.5, 0.5)), ("bayes", (1, 1))])
+def test_policies_are_corners_of_the_gate(policy, shares, rng):
+    """Where both writes saw the voxel; elsewhere what was there stays."""
+    gated, plain = new(), new()
+    for n, T, logits, mask in writes(rng, 2):
+        if not n:
+            for stream in (gated, plain):
+                stream.write(T, logits, mask)
+            continue
+        before = plain.copy()
+        plain.write(T, logits, mask, policy=policy)
+        gated.write(T, logits, mask, policy="gate", gate=lambda a, b, c: np.tile(np.float32(shares), (len(a), 1)))
+        both = before.known & (plain.writes == 2)
+        assert both.mean() > 0.05
+        np.testing.assert_allclose(gated.values[both], plain.values[both], atol=2e-2)
+        np.testing.assert_array_equal(gated.known, plain.known)
+        untouched = gated.writes == before.writes
+        np.testing.assert_array_equal(gated.values[untouched], before.values[untouched])
+
+
+def test_gate_is_told_how_often_how_long_ago_and_how_far(rng):
+    stream, seen = new(), np.zeros(SPEC.shape, bool)
+    seen[3, 4, 1] = seen[10, 10, 2] = True
+    told = []
+
+    def gate(fresh, old, facts):
+        told.append((old.copy(), facts.copy()))
+        return np.tile(np.float32([0.5, 1.0]), (len(fresh), 1))
+
+    logits = rng.normal(size=(*SPEC.shape, 3)).astype(np.float32)
+    for day in (0, 1, 3):
+        stream.write(at(0, 0, 0), logits, seen, policy="gate", gate=gate, stamp=1e9 + day * 86400)
+    far = np.hypot(-8 + 3.5 * 0.8, -8 + 4.5 * 0.8)
+    near = np.hypot(-8 + 10.5 * 0.8, -8 + 10.5 * 0.8)
+    for (_, facts), count, age in zip(told, (0, 1, 2), (0, 1, 2), strict=True):
+        np.testing.assert_allclose(facts, [[count, age, far], [count, age, near]], rtol=1e-5)
+    assert (told[0][0] == 0).all()
+    fresh = logits[seen] - logits[seen].mean(-1, keepdims=True)
+    np.testing.assert_allclose(told[2][0], 1.5 * fresh, atol=1e-2)
     with pytest.raises(ConfigError, match="policy is not known"):
-        new().write(T, first, everything, policy="gate")
+        new().write(at(0, 0, 0), logits, seen, policy="gate")
