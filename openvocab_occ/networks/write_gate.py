@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from openvocab_occ.errors import ModelError
 from openvocab_occ.io.files import PathLike
 from openvocab_occ.networks.checkpoint import fill, read_checkpoint
-from openvocab_occ.networks.lmop import LOGIT_LIMIT
+from openvocab_occ.networks.lmop import limited
 
 _LOGIT_SCALE = 0.2
 _FACTS = 4  # written before or not, how often, how long ago, how far away
@@ -41,7 +41,7 @@ class WriteGate(nn.Module):
         """
         agreement = (new.softmax(dim=-1) * old.softmax(dim=-1)).sum(dim=-1, keepdim=True)
         told = [(facts[:, :1] > 0).to(facts.dtype), facts[:, :2].log1p(), facts[:, 2:] / 40]
-        both = [x.clamp(-LOGIT_LIMIT, LOGIT_LIMIT) * _LOGIT_SCALE for x in (new, old)]
+        both = [limited(x) * _LOGIT_SCALE for x in (new, old)]
         return self.shares(torch.cat([*both, agreement, *told], dim=-1)).sigmoid()
 
     @torch.no_grad()

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Float32, Float64
 
 from openvocab_occ.errors import ConfigError
 from openvocab_occ.geometry import GridSpec
-from openvocab_occ.networks.lmop import LOGIT_LIMIT
+from openvocab_occ.networks.lmop import LOGIT_REACH, limited
 
 WritePolicy = Literal["newest", "overwrite", "ema", "bayes", "gate"]
 """`newest`: what is seen replaces. `overwrite`: and what is hidden is forgotten (Neural Map Prior's way). `ema`: half
@@ -22,7 +23,7 @@ Gate = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """From new logits [n, classes], old ones (0 where nothing was known) and facts [n, 3] to the shares [n, 2] of old and
 new in what is stored. Facts: how often the voxel was written, days since the last time, metres from the ego."""
 EMA_SHARE = 0.5
-BAYES_LIMIT = 20.0
+BAYES_REACH = 20.0  # evidence that has been added up; see networks.lmop.LOGIT_REACH
 DAY = 86400.0  # seconds
 
 
@@ -99,19 +100,19 @@ class StreamMap:
                               fix="a gate goes with policy='gate'")  # fmt: skip
         cells, source = self._footprint(T_world_ego)
         new = logits.reshape(-1, *logits.shape[2:])[source].astype(np.float32)
-        new = np.clip(new - new.mean(axis=-1, keepdims=True), -LOGIT_LIMIT, LOGIT_LIMIT)
+        new = _limited(new, LOGIT_REACH)
         seen = mask.reshape(-1, mask.shape[2])[source]
         old, before = self.values[cells].astype(np.float32), self.known[cells]
         if policy == "ema":
             new = np.where(before[..., None], old + EMA_SHARE * (new - old), new)
         elif policy == "bayes":
-            new = np.clip(old + new, -BAYES_LIMIT, BAYES_LIMIT)
+            new = _limited(old + new, BAYES_REACH)
         elif gate is not None:
             age = np.where(before, np.maximum(stamp - self.stamps[cells], 0) / DAY, 0)
             reach = np.broadcast_to(self._reach(source)[:, None], age.shape)
             facts = np.stack([self.writes[cells], age, reach], axis=-1).astype(np.float32)
             shares = gate(new[seen], old[seen], facts[seen])
-            new[seen] = np.clip(shares[:, :1] * old[seen] + shares[:, 1:] * new[seen], -BAYES_LIMIT, BAYES_LIMIT)
+            new[seen] = _limited(shares[:, :1] * old[seen] + shares[:, 1:] * new[seen], BAYES_REACH)
         if policy == "overwrite":
             self.values[cells] = np.where(seen[..., None], new, 0)
             self.known[cells] = seen
@@ -150,3 +151,7 @@ class StreamMap:
         x, y = (corner[k] + (np.arange(counts[k]) + 0.5) * self.cell for k in range(2))
         X, Y = np.meshgrid(x, y, indexing="ij")
         return X, Y
+
+
+def _limited(logits: np.ndarray, reach: float) -> np.ndarray:
+    return limited(torch.from_numpy(logits), reach).numpy()

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from openvocab_occ.errors import ConfigError, DataError
 from openvocab_occ.geometry import GridSpec
 from openvocab_occ.io.files import PathLike
-from openvocab_occ.networks.lmop import LOGIT_LIMIT, Lmop
+from openvocab_occ.networks.lmop import Lmop, limited
 from openvocab_occ.networks.losses import masked_cross_entropy
 from openvocab_occ.networks.predictor import OccupancyNetwork
 from openvocab_occ.networks.write_gate import WriteGate
@@ -26,7 +26,7 @@ from openvocab_occ.training.drives import Drive
 from openvocab_occ.training.latents import Latents
 from openvocab_occ.training.loop import Run, TrainConfig, class_weights, rate_at
 from openvocab_occ.training.memory import evaluate_memory
-from openvocab_occ.training.stream_map import BAYES_LIMIT, DAY
+from openvocab_occ.training.stream_map import BAYES_REACH, DAY
 from openvocab_occ.training.streams import MemoryConfig, Visit, hidden, written_mask
 
 Advance = Callable[[int, int], None]
@@ -41,7 +41,7 @@ class Written:
     drive: Drive
     frame: int
     logits: Float[np.ndarray, "x y z classes"]
-    """Centred, clamped; float16."""
+    """Centred, limited; float16."""
     mask: Bool[np.ndarray, "x y z"]
 
 
@@ -76,7 +76,7 @@ def record(
     found: dict[str, list[Written]] = {name: [] for name in places}
 
     def keep(visit: Visit, logits: np.ndarray) -> None:
-        centred = np.clip(logits - logits.mean(axis=-1, keepdims=True), -LOGIT_LIMIT, LOGIT_LIMIT).astype(np.float16)
+        centred = limited(torch.from_numpy(logits)).numpy().astype(np.float16)
         mask = written_mask(visit, logits.argmax(axis=-1).astype(np.uint8), network.config, memory.mask_from)
         found[visit.stream.place].append(Written(visit.drive, visit.frame, centred, mask))
 
@@ -163,7 +163,7 @@ def unroll(
         where = torch.from_numpy(place)
         old = held[where]
         shares = gate(new, old, facts)
-        stored = (shares[:, :1] * old + shares[:, 1:] * new).clamp(-BAYES_LIMIT, BAYES_LIMIT)
+        stored = limited(shares[:, :1] * old + shares[:, 1:] * new, BAYES_REACH)
         held = held.index_put((where,), stored)
         count[place] += 1
         last[place] = stamp

@@ -97,6 +97,48 @@ def test_missing_cameras_are_told(baseline):
         next(predictions(network, drive_frames(1, cameras=1), cameras=network.cameras))
 
 
+@pytest.mark.parametrize(
+    "error", [torch.OutOfMemoryError("CUDA out of memory"), MemoryError(),
+              RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried")]
+)  # fmt: skip
+def test_out_of_memory_names_the_remedy(baseline, monkeypatch, error):
+    def full(*_):
+        raise error
+
+    network = load_network("flashocc-micro", baseline)
+    monkeypatch.setattr(network.module, "forward", full)
+    with pytest.raises(ModelError, match=r"does not fit into the memory of cpu.*smaller network"):
+        network.predict(drive_frames(1)[0])
+
+
+def test_other_failures_are_not_taken_for_it(baseline, monkeypatch):
+    def broken(*_):
+        raise RuntimeError("shapes differ")
+
+    network = load_network("flashocc-micro", baseline)
+    monkeypatch.setattr(network.module, "forward", broken)
+    with pytest.raises(RuntimeError, match="shapes differ"):
+        network.predict(drive_frames(1)[0])
+
+
+def test_images_of_any_size_are_taken_and_too_small_ones_told(baseline):
+    network = load_network("flashocc-micro", baseline)
+    frame = drive_frames(1)[0]
+    twice = [
+        replace(
+            v, image=v.image.repeat(2, 0).repeat(2, 1), camera=v.camera.resized(2 * v.camera.width, 2 * v.camera.height)
+        )
+        for v in frame.views
+    ]
+    large = network.predict(replace(frame, views=tuple(twice)))
+    assert (large.argmax(-1) == network.predict(frame).argmax(-1)).mean() > 0.98
+    small = [
+        replace(v, image=np.ascontiguousarray(v.image[::16, ::16]), camera=v.camera.resized(8, 3)) for v in frame.views
+    ]
+    with pytest.raises(DataError, match="too small for the network"):
+        next(predictions(network, [replace(frame, views=tuple(small))]))
+
+
 def test_weights_that_are_no_numbers_are_told(baseline):
     network = load_network("flashocc-micro", baseline)
     with torch.no_grad():
@@ -141,6 +183,11 @@ class TestOnnx:
         prior = type("P", (), {"logits": logits, "known": known})() if with_memory else None
         ours, theirs = network.predict(frame, prior), exported.predict(frame, prior)
         assert (np.abs(ours - theirs) < 1e-3).mean() > 0.999
+        if not with_memory:  # and a foreign file that gives no numbers is told
+            torch.nn.init.constant_(network.module.occ_head.predicter[-1].bias, float("nan"))
+            broken = OnnxNetwork(export_onnx(network, tmp_path / "n.onnx", cameras=2))
+            with pytest.raises(ModelError, match="gives no numbers"):
+                broken.predict(frame)
         assert ours.std() > 1e-3
 
     def test_runs_with_the_map_as_ours_do(self, pair, tmp_path):
