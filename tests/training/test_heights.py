@@ -94,9 +94,9 @@ def test_training_teaches_the_height(drive, tmp_path):
             return float(height_loss(network.module.eval().latent_and_height(images, rig)[1], bins))
 
     first = judged()
-    train_baseline(network, [drive], tmp_path, TrainConfig(steps=8, batch=1, warm_up=1, loss="dhd", ema=0.0))
+    train_baseline(network, [drive], tmp_path, TrainConfig(steps=4, batch=1, warm_up=1, loss="dhd", ema=0.0))
     after = dict(network.module.named_parameters())
     assert sum(not torch.equal(after[n], v) for n, v in before.items()) > 0.9 * len(before)
-    assert judged() < 0.9 * first
+    assert judged() < first - 0.02
     lines = (tmp_path / "log.jsonl").read_text().splitlines()
     assert json.loads(lines[-1])["loss"] < json.loads(lines[0])["loss"]

@@ -136,7 +136,7 @@ def test_images_of_any_size_are_taken_and_too_small_ones_told(baseline):
         replace(v, image=np.ascontiguousarray(v.image[::16, ::16]), camera=v.camera.resized(8, 3)) for v in frame.views
     ]
     with pytest.raises(DataError, match="too small for the network"):
-        next(predictions(network, [replace(frame, views=tuple(small))]))
+        next(predictions(network, drive_frames(1).map(lambda f: replace(f, views=tuple(small)))))
 
 
 def test_weights_that_are_no_numbers_are_told(baseline):
