@@ -21,6 +21,7 @@ from openvocab_occ.io.files import PathLike, existing, sha256, written_folder
 from openvocab_occ.mapping import FreeSpace, VoxelMap
 from openvocab_occ.mapping.keys import pack_axes, packable
 from openvocab_occ.objects.feature_table import feature_table
+from openvocab_occ.objects.map_files import FILES, MapFiles
 from openvocab_occ.objects.map_rows import frame_table, frames_of, layer_table, layers_of, object_table, objects_of
 from openvocab_occ.objects.scene_map import EncoderInfo, Provenance, SceneMap
 from openvocab_occ.objects.tree import ObjectTree, SceneObject
@@ -28,16 +29,11 @@ from openvocab_occ.objects.tree import ObjectTree, SceneObject
 FORMAT = "openvocab_occ.map"
 VERSION = 1
 MANIFEST = "manifest.json"
-FILES = (
-    "voxels.parquet", "features.parquet", "space.parquet", "objects.parquet", "dynamic.parquet", "frames.parquet",
-)  # fmt: skip
 MAX_COSINE_ERROR = 0.01
 """How far a stored feature may be from the voxel's own, by default: a match of cosine 0.3 moves by at most 0.14, one of
 neighbours that share a vector by what they differ anyway."""
-HASHED_AT_ONCE = 1 << 24
-"""Bytes up to which a file is hashed when the map is opened (0.01 s); larger ones are by `verify_map` and, page by
-page, when they are read."""
 _ROW_GROUP = 1 << 16
+_TRIES = 5
 _AXES = ("x", "y", "z")
 _PARTS = {
     "keys": _AXES, "colors": ("red", "green", "blue"), "normals": ("normal_x", "normal_y", "normal_z"),
@@ -107,26 +103,38 @@ def write_map(scene: SceneMap, path: PathLike, *, max_cosine_error: float = MAX_
 
 
 def read_map(path: PathLike, *, region: Float[np.ndarray, "2 3"] | None = None) -> SceneMap:
-    """Read the folder; see `SceneMap.open`."""
+    """Read the folder; see `SceneMap.open`. Its files stay open, so that replacing the map does no harm to readers."""
     folder = existing(path, "map")
-    manifest = read_manifest(folder)
-    for name in FILES:
-        _check_file(folder, name, manifest)
+    manifest, files = _opened(folder)
     with _consistent(folder):
         info = manifest["encoder"]
         encoder = EncoderInfo(**(info | {"labels": tuple(info["labels"])}))
-        voxels, rows = _voxels(folder, manifest, encoder, region)
+        voxels, rows = _voxels(files, manifest, encoder, region)
         count = int(manifest["counts"]["voxels"])
 
         def nodes() -> list[SceneObject]:
             with _consistent(folder):
-                found = objects_of(_table(folder, "objects.parquet"), voxels, rows, count)
+                found = objects_of(files.table("objects.parquet"), voxels, rows, count)
                 return list(ObjectTree(found).nodes)
 
-        frames = frames_of(_table(folder, "frames.parquet"))
-        layers = layers_of(_table(folder, "dynamic.parquet"), encoder.dim)
+        frames = frames_of(files.table("frames.parquet"))
+        layers = layers_of(files.table("dynamic.parquet"), encoder.dim)
         names, provenance = tuple(manifest["class_names"]), Provenance(**manifest["provenance"])
         return SceneMap(voxels, ObjectTree.stored(nodes), encoder, frames, provenance, names, layers)
+
+
+def _opened(folder: Path) -> tuple[dict[str, Any], MapFiles]:
+    """Return the manifest and its files; again where the map was replaced between the two."""
+    for _ in range(_TRIES):
+        manifest, files = read_manifest(folder), MapFiles(folder)
+        try:
+            files.check(manifest)
+        except MapError:
+            if read_manifest(folder) == manifest:
+                raise
+        else:
+            return manifest, files
+    raise MapError(f"map {folder} is replaced faster than it can be opened", fix="try again")
 
 
 @contextmanager
@@ -173,8 +181,7 @@ def verify_map(path: PathLike) -> dict[str, Any]:
     """Hash every file and read every page of a map; return what its manifest says, or raise MapError."""
     folder = existing(path, "map")
     manifest = read_manifest(folder)
-    for name in FILES:
-        _check_file(folder, name, manifest, hash_all=True)
+    MapFiles(folder).check(manifest, hash_all=True)
     scene = read_map(folder)
     _, _, _ = scene.voxels.keys, scene.voxels.free, scene.objects.nodes
     columns = scene.voxels.columns()
@@ -183,44 +190,6 @@ def verify_map(path: PathLike) -> dict[str, Any]:
     if bad:
         raise MapError(f"columns of map {folder} are not finite", got=", ".join(bad), fix="rebuild the map")
     return {**manifest, "voxels": len(features), "bytes": sum(entry["bytes"] for entry in manifest["files"].values())}
-
-
-def _check_file(folder: Path, name: str, manifest: Mapping[str, Any], *, hash_all: bool = False) -> None:
-    """Check that a file is the one the manifest speaks of."""
-    path = folder / name
-    if not path.is_file():
-        raise MapError(f"map {folder} is incomplete", expected=name, got="no such file", fix="copy the whole folder")
-    try:
-        said, size, rows = (
-            manifest["files"][name]["sha256"],
-            manifest["files"][name]["bytes"],
-            manifest["counts"][name.removesuffix(".parquet")],
-        )
-    except (KeyError, TypeError) as error:
-        raise MapError(f"the manifest of map {folder} says nothing of {name}", got=f"missing {error}") from error
-    have = path.stat().st_size
-    if (hash_all or have <= HASHED_AT_ONCE or have != size) and (digest := sha256(path)) != said:
-        raise MapError(
-            f"{path} is damaged or was edited",
-            expected=f"sha256 {str(said)[:12]}...",
-            got=f"{digest[:12]}..., {have} bytes",
-            fix="copy it again, or rebuild the map",
-        )
-    try:
-        found = pq.read_metadata(path).num_rows
-    except (pa.ArrowInvalid, OSError) as error:
-        raise MapError(f"{path} cannot be read", expected="Parquet", got=error) from error
-    if found != rows:
-        raise MapError(f"{path} has another number of rows than its manifest says", expected=rows, got=found)
-
-
-def _table(folder: Path, name: str, columns: list[str] | None = None, groups: list[int] | None = None) -> pa.Table:
-    """Read columns of a file, checking each page; all row groups, or some."""
-    try:
-        with pq.ParquetFile(folder / name, page_checksum_verification=True) as file:
-            return file.read(columns) if groups is None else file.read_row_groups(groups, columns)
-    except (pa.ArrowException, OSError) as error:
-        raise MapError(f"{folder / name} cannot be read", expected="Parquet", got=error) from error
 
 
 def _write(table: pa.Table, path: Path) -> None:
@@ -258,19 +227,19 @@ def _space_table(space: FreeSpace) -> pa.Table:
 
 
 def _voxels(
-    folder: Path, manifest: Mapping[str, Any], encoder: EncoderInfo, region: Float[np.ndarray, "2 3"] | None
+    files: MapFiles, manifest: Mapping[str, Any], encoder: EncoderInfo, region: Float[np.ndarray, "2 3"] | None
 ) -> tuple[VoxelMap, Int64[np.ndarray, " n"] | None]:
     """Return the voxels, which are read when asked for, and which rows of the file they are; None for all."""
-    size, name = float(manifest["voxel_size"]), "voxels.parquet"
+    size = float(manifest["voxel_size"])
     count, groups, inside, rows = int(manifest["counts"]["voxels"]), None, None, None
     if region is not None:
-        groups, rows, inside = _inside(folder / name, region, size)
+        groups, rows, inside = _inside(files, region, size)
         count = len(rows)
-    read = _reader(folder, encoder.dim, groups, inside)
+    read = _reader(files, encoder.dim, groups, inside)
 
     def space() -> FreeSpace:
-        with _consistent(folder):
-            table = _table(folder, "space.parquet")
+        with _consistent(files.folder):
+            table = files.table("space.parquet")
             blocks = np.stack([table[axis].to_numpy() for axis in _AXES], axis=1).astype(np.int32)
             return FreeSpace.from_blocks(size, blocks, _rows_of(table["counts"], 512))
 
@@ -280,40 +249,40 @@ def _voxels(
     return voxels, rows
 
 
-def _keys(folder: Path, groups: list[int] | None) -> tuple[np.ndarray, ...]:
+def _keys(files: MapFiles, groups: list[int] | None) -> tuple[np.ndarray, ...]:
     """Return x, y, z of the voxels of all row groups, or some, once they are known to be in order."""
-    table = _table(folder, "voxels.parquet", list(_AXES), groups)
+    table = files.table("voxels.parquet", list(_AXES), groups)
     axes = tuple(table[axis].to_numpy().astype(np.int32, copy=False) for axis in _AXES)
     ends = np.array([[a.min(initial=0), a.max(initial=0)] for a in axes], dtype=np.int32).T
     packed = pack_axes(*axes)
     if not packable(ends).all() or (packed[1:] <= packed[:-1]).any():
-        raise MapError("voxel keys repeat, are too large or out of order", got=folder, fix="rebuild the map")
+        raise MapError("voxel keys repeat, are too large or out of order", got=files, fix="rebuild the map")
     return (*axes, packed)
 
 
 def _inside(
-    path: Path, region: Float[np.ndarray, "2 3"], size: float
+    files: MapFiles, region: Float[np.ndarray, "2 3"], size: float
 ) -> tuple[list[int], Int64[np.ndarray, " n"], Bool[np.ndarray, " m"]]:
     """Return the row groups that meet a region, the rows of the file in it, and which of the groups' rows they are."""
-    groups = _groups(path, region, size)
-    axes = _keys(path.parent, groups)[:3]
+    groups = _groups(files, region, size)
+    axes = _keys(files, groups)[:3]
     inside = (
         (low <= (a + 0.5) * size) & ((a + 0.5) * size < high) for a, (low, high) in zip(axes, region.T, strict=True)
     )
     chosen = np.logical_and.reduce(list(inside))
-    with pq.ParquetFile(path) as file:
+    with files.parquet("voxels.parquet") as file:
         lengths = [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)]
     first = np.cumsum([0, *lengths])
     rows = np.concatenate([np.arange(first[g], first[g + 1]) for g in groups] or [first[:0]])
     return groups, rows[chosen], chosen
 
 
-def _groups(path: Path, region: Float[np.ndarray, "2 3"], size: float) -> list[int]:
+def _groups(files: MapFiles, region: Float[np.ndarray, "2 3"], size: float) -> list[int]:
     """Return the row groups whose range of x meets the region."""
     if region.shape != (2, 3) or not np.isfinite(region).all() or (region[0] >= region[1]).any():
         raise ConfigError("region is not a box", expected="lower and upper corner, metres", got=region.tolist())
     low, high = np.floor(region[:, 0] / size)
-    with pq.ParquetFile(path) as file:
+    with files.parquet("voxels.parquet") as file:
         at = [file.metadata.row_group(i).column(0).statistics for i in range(file.num_row_groups)]
     return [i for i, x in enumerate(at) if x is None or (x.max >= low and x.min <= high)]
 
@@ -323,13 +292,15 @@ def _rows_of(column: pa.ChunkedArray, width: int) -> np.ndarray:
     return column.combine_chunks().flatten().to_numpy(zero_copy_only=False).reshape(-1, width)
 
 
-def _reader(folder: Path, dim: int, groups: list[int] | None, inside: np.ndarray | None) -> Callable[[str], np.ndarray]:
+def _reader(
+    files: MapFiles, dim: int, groups: list[int] | None, inside: np.ndarray | None
+) -> Callable[[str], np.ndarray]:
     """Return what reads a column of the voxels by the name it has in `VoxelMap`."""
 
     def column(name: str) -> pa.ChunkedArray:
-        table = _table(folder, "voxels.parquet", [name], groups)
+        table = files.table("voxels.parquet", [name], groups)
         if name not in table.column_names:
-            raise MapError(f"map {folder} contradicts itself", expected=f"a column {name}", got="none")
+            raise MapError(f"map {files} contradicts itself", expected=f"a column {name}", got="none")
         return table[name]
 
     def plain(name: str) -> np.ndarray:
@@ -338,11 +309,11 @@ def _reader(folder: Path, dim: int, groups: list[int] | None, inside: np.ndarray
 
     def read(name: str) -> np.ndarray:
         if name == "packed":
-            packed = _keys(folder, groups)[3]
+            packed = _keys(files, groups)[3]
             return packed if inside is None else packed[inside]
         if name == "features":
             row = plain("feature")
-            vectors = _features(folder, dim)
+            vectors = _features(files, dim)
             if len(row) and not 0 <= int(row.min()) <= int(row.max()) < len(vectors):
                 raise MapError(
                     "voxels point to features that are not there", expected=f"0..{len(vectors) - 1}", got=row.max()
@@ -355,7 +326,7 @@ def _reader(folder: Path, dim: int, groups: list[int] | None, inside: np.ndarray
         if name in _PARTS:
             values = np.stack([plain(part) for part in _PARTS[name]], axis=1)
             return values * _NORMAL_STEP if name == "normals" else values
-        if name == "color_weight" and "color_weight" not in pq.read_schema(folder / "voxels.parquet").names:
+        if name == "color_weight" and "color_weight" not in files.names("voxels.parquet"):
             return plain("weight")
         values = plain(name)
         return values.astype(np.float32) if name in ("agreement", "view_score") else values.copy()
@@ -363,9 +334,9 @@ def _reader(folder: Path, dim: int, groups: list[int] | None, inside: np.ndarray
     return read
 
 
-def _features(folder: Path, dim: int) -> Float32[np.ndarray, "t c"]:
+def _features(files: MapFiles, dim: int) -> Float32[np.ndarray, "t c"]:
     """Return the feature table."""
-    vectors = _table(folder, "features.parquet")["feature"]
+    vectors = files.table("features.parquet")["feature"]
     width = vectors.type.list_size
     features = _rows_of(vectors, width).astype(np.float32)
     bad = int((~np.isfinite(features)).any(axis=1).sum())

@@ -74,7 +74,6 @@ class Follower:
     def __init__(self, viewer: Viewer, path: PathLike, *, every: float = 1.0) -> None:
         """Begin to look at the folder each `every` seconds, in a thread of its own."""
         self._viewer, self._path = viewer, existing(path, "map")
-        _whole(viewer.scene)
         self._stamp = self._written()
         self._stop = threading.Event()
         self._every = every
@@ -98,7 +97,7 @@ class Follower:
             if stamp is None or stamp == self._stamp:
                 continue
             try:
-                self._viewer.show(_whole(SceneMap.open(self._path)))
+                self._viewer.show(SceneMap.open(self._path))
             except (MapError, NotFoundError) as error:  # being replaced, or empty; the next look tells
                 _log.info("%s cannot be shown: %s", self._path, error)
                 continue
@@ -110,10 +109,3 @@ class Follower:
         except FileNotFoundError:
             return None
         return found.st_mtime_ns, found.st_ino
-
-
-def _whole(scene: SceneMap) -> SceneMap:
-    """Read all of a map now: what is read later would come from files that were replaced meanwhile."""
-    scene.voxels.columns()
-    scene.voxels.features  # noqa: B018
-    return scene

@@ -72,7 +72,7 @@ def test_a_disk_that_is_full_is_told_and_leaves_the_old_map(scene, tmp_path):
 
 
 def test_verify_finds_what_lazy_opening_does_not_read(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("openvocab_occ.objects.ovmap.HASHED_AT_ONCE", 0)  # as if every file were large
+    monkeypatch.setattr("openvocab_occ.objects.map_files.HASHED_AT_ONCE", 0)  # as if every file were large
     saved = scene.save(tmp_path / "street.ovmap")
     verify_map(saved)
     file = saved / "features.parquet"

@@ -11,7 +11,7 @@ from openvocab_occ.errors import AlreadyExistsError, MapError, NotFoundError
 from openvocab_occ.io.files import sha256
 from openvocab_occ.mapping import VoxelMap
 from openvocab_occ.objects import SceneMap, group_objects
-from openvocab_occ.objects.ovmap import FILES
+from openvocab_occ.objects.map_files import FILES
 
 
 def edit_manifest(path, **changes):
@@ -182,3 +182,16 @@ def test_other_folders_are_never_replaced(scene, tmp_path):
     with pytest.raises(AlreadyExistsError, match=r"manifest\.json that is not a map's"):
         scene.save(tmp_path / "photos")
     shutil.rmtree(tmp_path / "photos")
+
+
+def test_a_map_that_is_replaced_or_removed_stays_whole_for_its_readers(scene, saved):
+    opened, truth = SceneMap.open(saved), SceneMap.open(saved)
+    expected = truth.voxels.features, truth.voxels.columns(), truth.objects.nodes
+    empty = VoxelMap(0.4, scene.encoder.dim, contract=scene.encoder.contract)
+    SceneMap(empty, group_objects(empty), scene.encoder).save(saved)
+    assert len(SceneMap.open(saved).voxels) < len(opened.voxels)
+    shutil.rmtree(saved)
+    np.testing.assert_array_equal(opened.voxels.features, expected[0])
+    for name, column in expected[1].items():
+        np.testing.assert_array_equal(opened.voxels.columns()[name], column)
+    assert [node.id for node in opened.objects.nodes] == [node.id for node in expected[2]]
