@@ -14,13 +14,15 @@ import torch
 from benchmarks.lmpocc.scales import Scale
 from benchmarks.lmpocc.ways import LONG_TERM, Way, Weights, trained, ways
 from openvocab_occ.io.files import written_file
-from openvocab_occ.networks.lmop import Lmop
+from openvocab_occ.networks.lmop import LOGIT_REACH, Lmop
 from openvocab_occ.networks.predictor import OccupancyNetwork, load_network
 from openvocab_occ.networks.write_gate import load_write_gate
+from openvocab_occ.occupancy import OCC3D_CLASSES
 from openvocab_occ.training.drives import Drive, by_place, city_drives
 from openvocab_occ.training.latents import Latents, cache_latents
 from openvocab_occ.training.loop import FINAL, train_baseline
 from openvocab_occ.training.memory import Writer, evaluate_memory, train_memory
+from openvocab_occ.training.statistics import Row
 from openvocab_occ.training.stream_map import Gate
 from openvocab_occ.training.streams import MemoryConfig, Visit
 from openvocab_occ.training.write_gate import record, train_write_gate
@@ -123,6 +125,8 @@ def _evaluate(
 def _writer(way: Way, ground: Ground, grounds: dict[str, Ground]) -> Writer | None:
     if not way.writer:
         return None
+    if way.writer == "truth":
+        return _true_logits
     source = ground if way.writer == "base" else grounds[way.writer]
     head = source.network.module.occ_head
 
@@ -133,7 +137,12 @@ def _writer(way: Way, ground: Ground, grounds: dict[str, Ground]) -> Writer | No
     return write
 
 
-def read_rows(path: Path) -> list[dict[str, Any]]:
+def _true_logits(visits: Sequence[Visit]) -> np.ndarray:
+    sure = LOGIT_REACH * np.eye(len(OCC3D_CLASSES), dtype=np.float32)
+    return np.stack([sure[v.drive.labels[v.frame]] for v in visits])
+
+
+def read_rows(path: Path) -> list[Row]:
     """Read an evaluation."""
     with gzip.open(path, "rt") as stream:
         return json.load(stream)

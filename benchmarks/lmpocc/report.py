@@ -33,9 +33,10 @@ NAMES = {
     "noise-0.5m": "LMOP, read 0.5 m and 1 degree off",
     "noise-1m": "LMOP, read 1 m and 2 degrees off",
     "written-by-base": "LMOP, map written by the frozen baseline",
+    "written-by-truth": "LMOP, map written from the labels (no network could do better)",
 }
 WRITING = ("write-gate", "policy-overwrite", "policy-ema", "policy-bayes", "removed-v1", "removed-v2", "mask-truth",
-           "mask-none", "written-by-base")  # fmt: skip
+           "mask-none", "written-by-base", "written-by-truth")  # fmt: skip
 """Ways that differ from `other_logs` in what is written alone."""
 Seeds = list[list[Row]]
 _SAID = {True: "yes", False: "no", None: "says nothing: the control knows no dynamic class"}

@@ -29,7 +29,8 @@ class Way:
     blind: bool = False
     """Read for the regions' sake, but predict with an empty prior."""
     writer: str = ""
-    """`base`: the baseline's own head writes the map. A network's name: that baseline writes it."""
+    """`base`: the baseline's own head writes the map; `truth`: the labels do, the most that any writer could give. A
+    network's name: that baseline writes it."""
     gate: bool = False
     """A learned gate writes the map."""
 
@@ -87,7 +88,7 @@ def ways(tables: tuple[str, ...], other_network: str = "") -> list[Way]:
             Way(name=f"trained-removal-{v}", weights=f"removal-{v}", memory=_reads(dynamic=v)) for v in ("v1", "v2")
         ]
     if "cross" in tables:
-        found += [Way(name="written-by-base", weights="lmop", writer="base")]
+        found += [Way(name=f"written-by-{w}", weights="lmop", writer=w) for w in ("base", "truth")]
         found += (
             [Way(name=f"written-by-{other_network}", weights="lmop", writer=other_network)] if other_network else []
         )

@@ -99,7 +99,7 @@ def train_baseline(
             if isinstance(module, Dhd) and config.loss == "dhd":
                 latent, told = module.latent_and_height(images.to(device), rig.to(device))
                 logits = module.occ_head(latent).float()
-                bins = np.stack([height_bins(d, f, network.config, told.shape[3:]) for d, f in chosen])
+                bins = np.stack([height_bins(d, f, network.config, (told.shape[3], told.shape[4])) for d, f in chosen])
                 height = 0.1 * height_loss(told, torch.from_numpy(bins).to(device))
             else:
                 logits = module(images.to(device), rig.to(device)).float()
