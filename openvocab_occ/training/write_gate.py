@@ -49,12 +49,12 @@ class Written:
 class GateConfig:
     """How a gate is trained."""
 
-    steps: int = 240
+    steps: int = 120
     frames: int = 2
     """Whose reading is judged in a step."""
     writes: int = 10
     """Most writes before each; how many, and which, is drawn."""
-    rate: float = 5e-3
+    rate: float = 5e-2
     map_weight: float = 1.0
     """Of the map's own cross entropy, beside that of the prediction which reads it."""
     seed: int = 0

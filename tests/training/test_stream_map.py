@@ -6,6 +6,7 @@ import pytest
 from openvocab_occ.errors import ConfigError
 from openvocab_occ.geometry import GridSpec, pose
 from openvocab_occ.memory import TileMap
+from openvocab_occ.networks.lmop import LOGIT_REACH
 from openvocab_occ.training.stream_map import BAYES_REACH, EMA_SHARE, StreamMap
 
 SPEC = GridSpec((-8.0, -8.0, -1.0), 0.8, (20, 20, 4))
@@ -47,7 +48,8 @@ def test_sure_logits_keep_their_order(rng):
     stream.write(T, logits, everything)
     found = stream.read(T).logits
     np.testing.assert_array_equal(found.argmax(-1), logits.argmax(-1))
-    np.testing.assert_allclose(found[..., 0] - found[..., 1], logits[..., 0] - logits[..., 1], atol=2e-2)
+    apart = np.clip(logits[..., 0] - logits[..., 1], -LOGIT_REACH, LOGIT_REACH)
+    np.testing.assert_allclose(found[..., 0] - found[..., 1], apart, atol=2e-2)
     assert np.abs(found.mean(-1)).max() < 1e-2
     for _ in range(5):
         stream.write(T, logits, everything, policy="bayes")
@@ -97,7 +99,7 @@ def test_policies_are_corners_of_the_gate(policy, shares, rng):
         plain.write(T, logits, mask, policy=policy)
         gated.write(T, logits, mask, policy="gate", gate=lambda a, b, c: np.tile(np.float32(shares), (len(a), 1)))
         both = before.known & (plain.writes == 2)
-        assert both.mean() > 0.05
+        assert both.sum() > 200
         np.testing.assert_allclose(gated.values[both], plain.values[both], atol=2e-2)
         np.testing.assert_array_equal(gated.known, plain.known)
         untouched = gated.writes == before.writes
