@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from openvocab_occ.cli.encoder import encoder_for
 from openvocab_occ.cli.output import console, print_json
 
 Place = Literal["front", "rig", "trajectory", "route", "ahead", "object", "hits"]
@@ -35,7 +36,8 @@ def views(
             drive every METRES; route: along the way ahead of a frame for METRES; ahead: METRES ahead on that way;
             object: the best view of OBJECT; hits: few views that show the hits of QUERY.
         query: Put the answer to this into the bundle.
-        encoder: The ONNX model that made the map; needed where words become vectors (dense models).
+        encoder: The ONNX model that made the map; needed where words become vectors (dense models), except where the
+            shipped model made it.
         card: The model's card, if it does not lie beside it.
         frame: Index of the frame to stand at; the middle one by default, for routes the first.
         metres: Distance or spacing, see PLACE; 20, for a route 100.
@@ -50,10 +52,9 @@ def views(
     from openvocab_occ.export.views import ViewBundle, ViewOptions, choose, export_views, lookout
     from openvocab_occ.objects.scene_map import SceneMap
     from openvocab_occ.query.find import find
-    from openvocab_occ.segmentation.onnx import load_encoder
 
     scene = SceneMap.open(map)
-    model = load_encoder(encoder, card) if encoder else None
+    model = encoder_for(map, encoder, card)
     answer = find(scene, query, model) if query else None
     options = ViewOptions(number_by=number_by, **dict.fromkeys(leave_out, False))
     width, height = size
@@ -144,16 +145,16 @@ def mcp(
 
     Args:
         map: A saved map, NAME.ovmap.
-        encoder: The ONNX model that made the map; needed where words become vectors (dense models).
+        encoder: The ONNX model that made the map; needed where words become vectors (dense models), except where the
+            shipped model made it.
         card: The model's card, if it does not lie beside it.
         other: A second map of the same place, that `diff` may compare with.
         out: Folder for pictures; a temporary one by default.
         json: Print the tools with the schemas of their arguments as one JSON object, and serve nothing.
     """
     from openvocab_occ.export.mcp_server import MapTools, described, server
-    from openvocab_occ.segmentation.onnx import load_encoder
 
-    model = load_encoder(encoder, card) if encoder else None
+    model = encoder_for(map, encoder, card)
     maps = {"map": map} | ({"other": other} if other else {})
     made = server(MapTools(maps, model, out))
     if json:

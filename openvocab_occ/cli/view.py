@@ -6,6 +6,7 @@ from typing import Annotated
 
 import tyro
 
+from openvocab_occ.cli.encoder import encoder_for
 from openvocab_occ.cli.output import console, print_json
 
 
@@ -28,7 +29,8 @@ def view(
 
     Args:
         map: A saved map, NAME.ovmap, or a folder of them.
-        encoder: The ONNX model that made the map; needed where words become vectors (dense models).
+        encoder: The ONNX model that made the map; needed where words become vectors (dense models), except where the
+            shipped model made it.
         card: The model's card, if it does not lie beside it.
         images: Kind and path of the drive, as `map` takes them, for the photos; a map holds none.
         option: Options of that kind, each KEY=VALUE.
@@ -45,7 +47,6 @@ def view(
     from openvocab_occ.cli.source import Source
     from openvocab_occ.memory import TileMap
     from openvocab_occ.objects.scene_map import SceneMap
-    from openvocab_occ.segmentation.onnx import load_encoder
     from openvocab_occ.viewer import server
     from openvocab_occ.viewer.layers import ChangesLayer, Layer, TileMapLayer
     from openvocab_occ.viewer.live import Follower
@@ -59,7 +60,7 @@ def view(
         layers += [TileMapLayer(city, scene=shown, by="agent"), TileMapLayer(city, scene=shown, by="class")]
     running = server.view(
         shown,
-        load_encoder(encoder, card) if encoder else None,
+        encoder_for(map, encoder, card),
         sequence=Source(*images, option=list(option)).load() if images else None,
         layers=layers,
         host=host,

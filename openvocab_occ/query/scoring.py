@@ -110,7 +110,7 @@ class Scorer:
                 "this map needs its text encoder to understand words",
                 expected=f"encoder {self.info.name} with a text side",
                 got="no encoder" if self.encoder is None else "an encoder without a text side",
-                fix="pass it: find(scene, text, encoder)",
+                fix="pass the model that made it: find(scene, text, encoder), or --encoder FILE",
             )
         phrase = singular(text)
         unknown = self._unknown(phrase)

@@ -9,7 +9,7 @@ import pytest
 
 from openvocab_occ.cli import COMMANDS, main
 from openvocab_occ.segmentation.card_files import SHIPPED
-from openvocab_occ.segmentation.demo_models import street_model
+from openvocab_occ.segmentation.demo_models import demo_model, street_model
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +70,21 @@ def test_map_find_export_print_json(street, tmp_path, capsys):
     assert report["frames"] == 1
     assert report["synthetic"] is True
     assert report["voxels"] > 0
+
+
+def test_maps_of_the_shipped_model_are_asked_without_naming_it(tmp_path, capsys):
+    path = tmp_path / "street.ovmap"
+    arguments = ["map", "street", "any", "--encoder", str(demo_model()), "--out", str(path), "--frames", "1", "--json"]
+    assert main(arguments) == 0
+    capsys.readouterr()
+    assert main(["find", str(path), "trees", "--json"]) == 0
+    alone = printed(capsys)
+    assert main(["find", str(path), "trees", "--encoder", str(demo_model()), "--json"]) == 0
+    assert printed(capsys)["hits"] == alone["hits"]
+    manifest = json.loads((path / "manifest.json").read_text())
+    manifest["encoder"]["fingerprint"] = "0" * 64
+    (path / "manifest.json").write_text(json.dumps(manifest))
+    assert "--encoder FILE" in refused(capsys, "find", path, "trees")
 
 
 def test_people_get_text(street, capsys):

@@ -194,9 +194,7 @@ def test_words_that_the_text_model_does_not_know_are_told():
 
 def test_an_encoder_that_is_missing_mute_other_or_broken_is_told(street):
     scene = scene_of([[1.0, 0.0]], contract="dense")
-    with pytest.raises(
-        ConfigError, match=r"needs its text encoder.*got no encoder; pass it: find\(scene, text, encoder"
-    ):
+    with pytest.raises(ConfigError, match=r"needs its text encoder.*got no encoder; pass the model that made it"):
         find(scene, "tree")
     with pytest.raises(ConfigError, match="an encoder without a text side"):
         find(scene, "tree", Encoder())
