@@ -58,7 +58,8 @@ def report(scale: Scale, out: Path, *, command: str, where: str, docs: Path | No
     size = (
         f"{len(scale.train.cities)} cities to train and {len(scale.test.cities)} others to test, {scale.train.visits} "
         f"visits of {scale.train.frames} frames each; baseline {base.steps} steps of {base.batch}, memory and control "
-        f"{memory.steps} of {memory.batch}; seeds {seeds} of memory and control on one baseline. `{command}`, {where}. "
+        f"{memory.steps} of {memory.batch}; gates {scale.gate_training.steps} steps on {len(scale.gate.cities)} more "
+        f"cities; seeds {seeds} of memory and control on one baseline. `{command}`, {where}. "
         "Synthetic."
     )
     text = [size, "", *text]
@@ -206,6 +207,7 @@ def _plots(found: dict[str, Any], out: Path, name: str) -> None:
             [found["by_condition"][n][group] for n in names],
             color,
             group,
+            line=False,
         )
         right.set_xticks(range(len(names)), names)
     left.set_xticks(sorted(found["by_visit"]))
@@ -228,25 +230,29 @@ def _writing_plot(found: dict[str, Any], out: Path, name: str) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    ways = [way for way in WRITING if way in found.get("map_gains", {})]
+    ways = [way for way in WRITING if way in found.get("map_gains", {}) and way != "written-by-truth"]
     if not ways:
         return
-    figure, axis = plt.subplots(figsize=(7.5, 0.8 + 0.42 * len(ways)), layout="constrained")
-    for values, color, label, shift in (
-        ([found["map_gains"][w]["all"] for w in ways], "tab:blue", "the map itself", -0.13),
-        ([found["gains"][f"{w} - other_logs"]["all"] for w in ways], "tab:orange", "the next visit's prediction", 0.13),
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9.5, 1.2 + 0.36 * len(ways)), layout="constrained", sharey=True)
+    for axis, color, what, values in (
+        (left, "tab:blue", "the map itself", [found["map_gains"][w]["all"] for w in ways]),
+        (
+            right,
+            "tab:orange",
+            "the next visit's prediction",
+            [found["gains"][f"{w} - other_logs"]["all"] for w in ways],
+        ),
     ):
         mean = [v["mean"] for v in values]
         sides = [[max(v["mean"] - v["low"], 0) for v in values], [max(v["high"] - v["mean"], 0) for v in values]]
-        axis.errorbar(mean, [i + shift for i in range(len(ways))], xerr=sides, fmt="o", color=color, label=label,
-                      capsize=3, markersize=4)  # fmt: skip
-    axis.set_yticks(range(len(ways)), [NAMES[w].removeprefix("LMOP, ") for w in ways])
-    axis.invert_yaxis()
-    axis.axvline(0, color="0.6", linewidth=0.8)
-    axis.set_xlabel("points of mIoU against replacing what is seen; 95 % intervals")
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.legend(frameon=False, fontsize=8)
-    axis.set_title(f"{name}: what is written (synthetic)", fontsize=10)
+        axis.errorbar(mean, range(len(ways)), xerr=sides, fmt="o", color=color, capsize=3, markersize=4)
+        axis.axvline(0, color="0.6", linewidth=0.8)
+        axis.set_title(what, fontsize=10)
+        axis.set_xlabel("points of mIoU")
+        axis.spines[["top", "right"]].set_visible(False)
+    left.set_yticks(range(len(ways)), [NAMES[w].removeprefix("LMOP, ") for w in ways])
+    left.invert_yaxis()
+    figure.suptitle(f"{name}: ways to write against replacing what is seen (synthetic), 95 % intervals", fontsize=10)
     figure.savefig(out / f"{name}-writing.png", dpi=120)
     plt.close(figure)
 

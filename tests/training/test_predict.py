@@ -19,7 +19,15 @@ from openvocab_occ.occupancy import OCC3D_CLASSES, OCC3D_FREE
 from openvocab_occ.training.latents import cache_latents
 from openvocab_occ.training.loop import TrainConfig
 from openvocab_occ.training.memory import train_memory
-from openvocab_occ.training.predict import MapUse, check_map, occ3d_labels, open_map, predictions, write_predictions
+from openvocab_occ.training.predict import (
+    MapUse,
+    check_map,
+    occ3d_labels,
+    occupancy_of,
+    open_map,
+    predictions,
+    write_predictions,
+)
 from openvocab_occ.training.statistics import Outcome, chosen, gain, outcome_of
 
 from .conftest import PLAN, drive_frames
@@ -45,6 +53,21 @@ def test_submission_files_are_read_back(baseline, tmp_path):
         np.testing.assert_array_equal(frame.occupancy.labels, expected)
         assert expected[:50].min() == OCC3D_FREE  # beyond the network's reach
         assert (expected[50:150:2, 50:150:2, ::2] == network.predict(given).argmax(-1)).all()
+
+
+def test_grids_given_to_a_map_are_those_of_the_files(memory, tmp_path, capsys):
+    network, frames = load_network("flashocc-micro", memory, memory=True), drive_frames(1)
+    city = open_map(tmp_path / "c.tiles", network)
+    write_predictions(network, drive_frames(1, day=1), tmp_path / "other", city, MapUse(log="b"))
+    write_predictions(network, frames, tmp_path / "mine", city, MapUse(log="a", write=False))
+    give = occupancy_of(network, city)
+    for frame in join_occupancy(frames, str(tmp_path / "mine" / "{token}.npz")):
+        grid = give(frame)
+        np.testing.assert_array_equal(grid.labels, frame.occupancy.labels)
+        np.testing.assert_array_equal(grid.T_world_grid, frame.occupancy.T_world_grid)
+    assert set(city.logs()) == {"b"}
+    assert main(["eval", "grounding", "--seeds", "1", "--occupancy", "network"]) == 2
+    assert "--weights" in capsys.readouterr().err
 
 
 def test_second_drive_remembers_the_first(memory, tmp_path):
@@ -265,7 +288,7 @@ def test_experiments_end_in_tables(drives, tmp_path, monkeypatch):
     from benchmarks.lmpocc import experiments, report, scales
 
     (tmp_path / "drives").symlink_to(drives[0].path.parent)
-    scale = replace(scales.SMOKE, tables=("II",))
+    scale = replace(scales.SMOKE, tables=("II", "gate"), gate=PLAN)
     assert list(scale.train.drives()) == list(PLAN.drives())
     scale = replace(scale, test=PLAN)
     said: list[str] = []
@@ -274,7 +297,8 @@ def test_experiments_end_in_tables(drives, tmp_path, monkeypatch):
     page.write_text(f"before\n{report.BEGIN}\nold\n{report.END}\nafter\n")
     found = report.report(scale, tmp_path, command="c", where="w", docs=page)
     numbers = found["flashocc-micro"]
-    assert set(numbers["ways"]) == {"base", "head", "empty", "other_logs", "all", "elsewhere"}
+    assert set(numbers["ways"]) == {"base", "head", "empty", "other_logs", "all", "elsewhere", "write-gate"}
+    assert set(numbers["map_gains"]) == {"write-gate"}
     assert len(numbers["bars"]) == 4
     text = page.read_text()
     assert text.startswith("before")
