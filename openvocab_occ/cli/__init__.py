@@ -49,6 +49,8 @@ COMMANDS = {
     "memory info": Command("memory:info", "describe a global map"),
     "memory verify": Command("memory:verify", "find damaged tiles, and mend them from the journal"),
     "memory rebuild": Command("memory:rebuild", "make a map anew, without an agent or by another policy"),
+    "memory consolidate": Command("memory:consolidate", "merge drives into the base of a map"),
+    "memory prune": Command("memory:prune", "drop journal entries that are folded into the base"),
     "memory export": Command("memory:export", "draw a map, or write its voxels to a file"),
     "crowdsource": Command("crowdsource:crowdsource", "let agents drive concurrently into one map"),
     "eval memory": Command("eval_memory:memory", "show what the global map is good for, on synthetic streets"),

@@ -32,6 +32,7 @@ def memory(
         f"window, cached   {report['window_cached_ms']:8.1f} ms  {report['window_cached_ratio']:.2f} x numpy's",
         f"window, cold     {report['window_cold_ms']:8.1f} ms  {report['window_cold_ratio']:.2f} x decoding its chunks",
         f"  and numpy's gather        {report['window_cold_ratio_to_files_and_gather']:.2f} x",
+        f"  decoding and zeros alone  {report['window_floor_ratio_to_files']:.2f} x decoding its chunks",
         f"durable update   {report['update_ms']:8.1f} ms  {report['update_ratio']:.2f} x the same files, fsynced",
         f"  and journal    {report['journaled_update_ms']:8.1f} ms  {report['journaled_update_ratio']:.2f} x",
         f"  eight at a time {report['update_ms_in_batches_of_8']:7.1f} ms each",

@@ -238,6 +238,45 @@ def rebuild(map: Map, *, without: tuple[str, ...] = (), out: str | None = None, 
     _show(report, text, json)
 
 
+def prune(map: Map, *, before: float | None = None, json: bool = False) -> None:
+    """Drop journal entries that are folded into the base; the map stays as it is.
+
+    It can still be rebuilt, but not any more without the agents whose entries were dropped, nor folded otherwise.
+
+    Args:
+        map: The map; logs of it that are not merged keep their entries.
+        before: Only entries of before this time, Unix seconds.
+        json: Print one JSON object.
+    """
+    from openvocab_occ.memory.prune import prune as drop
+
+    city = TileMap.open(map)
+    with progress("pruning", unit="entries") as advance:
+        dropped = drop(city, before=before, progress=advance)
+    report = {"map": map, "entries": dropped.entries, "bytes": dropped.size, "agents": [*dropped.agents]}
+    text = f"{dropped.entries} journal entries, {dropped.size / 1e6:.1f} MB dropped"
+    bound = f"; part of the map for good: {', '.join(dropped.agents)}" if dropped.agents else ""
+    _show(report, text + bound, json)
+
+
+def consolidate(map: Map, *, logs: tuple[str, ...] = (), json: bool = False) -> None:
+    """Merge logs into the base, where reads are cheaper and they cannot be left out any more.
+
+    Args:
+        map: The map.
+        logs: Those to merge; all by default. Nobody should be writing them.
+        json: Print one JSON object.
+    """
+    city = TileMap.open(map)
+    chosen = logs or tuple(log for log, merged in city.logs().items() if not merged)
+    tiles = 0
+    with progress("merging", unit="logs") as advance:
+        for done, log in enumerate(chosen, start=1):
+            tiles += city.consolidate(log)
+            advance(done, len(chosen))
+    _show({"map": map, "logs": [*chosen], "tiles": tiles}, f"{tiles} tiles of {len(chosen)} logs merged", json)
+
+
 def export(map: Map, *, out: Path, by: Literal["class", "agent"] = "class", exclude: tuple[str, ...] = (),
            json: bool = False) -> None:  # fmt: skip
     """Write the occupied voxels as a picture (.png: from above and from the front), as .npz or as .ply.

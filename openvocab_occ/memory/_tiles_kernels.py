@@ -25,11 +25,14 @@ def locate(affine, rows, out):
     found = 0
     for cell in range(out.shape[0]):
         x, y = cell // _SIDE + 0.5, cell % _SIDE + 0.5
+        u = affine[0, 0] * x + affine[0, 1] * y + affine[0, 3] + _SNAP
+        v = affine[1, 0] * x + affine[1, 1] * y + affine[1, 3] + _SNAP
+        w = affine[2, 0] * x + affine[2, 1] * y + affine[2, 3] + _SNAP
         for h in range(out.shape[1]):
             z = h + 0.5
-            i = int(np.floor(affine[0, 0] * x + affine[0, 1] * y + affine[0, 2] * z + affine[0, 3] + _SNAP))
-            j = int(np.floor(affine[1, 0] * x + affine[1, 1] * y + affine[1, 2] * z + affine[1, 3] + _SNAP))
-            k = int(np.floor(affine[2, 0] * x + affine[2, 1] * y + affine[2, 2] * z + affine[2, 3] + _SNAP))
+            i = int(np.floor(u + affine[0, 2] * z))
+            j = int(np.floor(v + affine[1, 2] * z))
+            k = int(np.floor(w + affine[2, 2] * z))
             row = -1
             if 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
                 row = rows[i, j, k]
@@ -112,17 +115,28 @@ def _slot(table, x, y, z, heights):
 def _set(codes, levels, weight, out):
     """Write weight times the logits of a voxel to out; with `levels` they are codes, and centred here."""
     count = out.shape[0]
-    if levels.shape[0] > 0:
-        mean = np.float32(0.0)
-        for c in range(count):
-            out[c] = levels[np.uint8(codes[c])]
-            mean += out[c]
-        mean /= np.float32(count)
-        for c in range(count):
-            out[c] = weight * (out[c] - mean)
-    else:
+    if levels.shape[0] == 0:
         for c in range(count):
             out[c] = weight * np.float32(codes[c])
+        return
+    one = two = three = np.float32(0.0)  # three sums, six classes at a time: each addition waits for the one before
+    sixes = count // 6 * 6
+    for c in range(0, sixes, 6):
+        a, b, d = levels[np.uint8(codes[c])], levels[np.uint8(codes[c + 1])], levels[np.uint8(codes[c + 2])]
+        e, f, g = levels[np.uint8(codes[c + 3])], levels[np.uint8(codes[c + 4])], levels[np.uint8(codes[c + 5])]
+        out[c], out[c + 1], out[c + 2], out[c + 3], out[c + 4], out[c + 5] = a, b, d, e, f, g
+        one += a + e
+        two += b + f
+        three += d + g
+    for c in range(sixes, count):
+        out[c] = levels[np.uint8(codes[c])]
+        one += out[c]
+    mean = (one + two + three) / np.float32(count)
+    for c in range(count):
+        out[c] -= mean
+    if weight != np.float32(1.0):
+        for c in range(count):
+            out[c] *= weight
 
 
 @kernel
@@ -144,6 +158,27 @@ def _add(values, slot, cell, h, levels, weight, out):
 
 @kernel
 @no_type_check
+def _mix(table, values, stamps, levels, fading, u, v, iw, row):
+    """Add to row the known ones of the four columns around (u, v), where whole numbers are centres of columns."""
+    now, rate = fading
+    iu, iv = int(np.floor(u)), int(np.floor(v))
+    fu, fv = u - iu, v - iv
+    total = 0.0
+    for a in range(2):
+        for b in range(2):
+            share = (fu if a else 1.0 - fu) * (fv if b else 1.0 - fv)
+            slot, cell, h = _slot(table, iu + a, iv + b, iw, values.shape[2])
+            if share > 0.0 and slot >= 0 and stamps[slot, cell, h] != 0:
+                total += share
+                if rate > 0.0:
+                    share *= np.exp(-rate * max(0.0, now - np.float64(stamps[slot, cell, h])))
+                _add(values, slot, cell, h, levels, np.float32(share), row)
+    for c in range(row.shape[0]):
+        row[c] /= np.float32(total)
+
+
+@kernel
+@no_type_check
 def gather(affine, table, values, stamps, levels, fading, bilinear, start, stop, out, out_known):
     """Read slices start..stop of a window: values where the nearest voxel is known, else 0.
 
@@ -155,15 +190,21 @@ def gather(affine, table, values, stamps, levels, fading, bilinear, start, stop,
     _, ny, nz, count = out.shape
     for i in range(start, stop):
         for j in range(ny):
+            x, y = i + 0.5, j + 0.5
+            u0 = affine[0, 0] * x + affine[0, 1] * y + affine[0, 3] + _SNAP
+            v0 = affine[1, 0] * x + affine[1, 1] * y + affine[1, 3] + _SNAP
+            w0 = affine[2, 0] * x + affine[2, 1] * y + affine[2, 3] + _SNAP
+            column, slot, cell = (-1, -1, -1), -1, 0
             for k in range(nz):
                 row = out[i, j, k]
-                x, y, z = i + 0.5, j + 0.5, k + 0.5
-                u = affine[0, 0] * x + affine[0, 1] * y + affine[0, 2] * z + affine[0, 3] + _SNAP
-                v = affine[1, 0] * x + affine[1, 1] * y + affine[1, 2] * z + affine[1, 3] + _SNAP
-                w = affine[2, 0] * x + affine[2, 1] * y + affine[2, 2] * z + affine[2, 3] + _SNAP
+                u, v, w = u0 + affine[0, 2] * (k + 0.5), v0 + affine[1, 2] * (k + 0.5), w0 + affine[2, 2] * (k + 0.5)
                 iu, iv, iw = int(np.floor(u)), int(np.floor(v)), int(np.floor(w))
-                slot, cell, h = _slot(table, iu, iv, iw, heights)
-                known = slot >= 0 and stamps[slot, cell, h] != 0
+                floor = iw // heights if iw >= heights else 0
+                if iu != column[1] or iv != column[2] or floor != column[0]:  # seldom, as poses are nearly upright
+                    column = floor, iu, iv
+                    slot, cell, _ = _slot(table, iu, iv, floor * heights, heights)
+                h = iw - floor * heights
+                known = slot >= 0 and h >= 0 and stamps[slot, cell, h] != 0
                 out_known[i, j, k] = known
                 if known and not bilinear:
                     weight = np.float32(1.0)
@@ -173,19 +214,5 @@ def gather(affine, table, values, stamps, levels, fading, bilinear, start, stop,
                     continue
                 for c in range(count):
                     row[c] = 0.0
-                if not known:
-                    continue
-                iu, iv = int(np.floor(u - _SNAP - 0.5)), int(np.floor(v - _SNAP - 0.5))
-                fu, fv = u - _SNAP - 0.5 - iu, v - _SNAP - 0.5 - iv
-                total = 0.0
-                for a in range(2):
-                    for b in range(2):
-                        share = (fu if a else 1.0 - fu) * (fv if b else 1.0 - fv)
-                        slot, cell, h = _slot(table, iu + a, iv + b, iw, heights)
-                        if share > 0.0 and slot >= 0 and stamps[slot, cell, h] != 0:
-                            total += share
-                            if rate > 0.0:
-                                share *= np.exp(-rate * max(0.0, now - np.float64(stamps[slot, cell, h])))
-                            _add(values, slot, cell, h, levels, np.float32(share), row)
-                for c in range(count):
-                    row[c] /= np.float32(total)
+                if known:
+                    _mix(table, values, stamps, levels, fading, u - _SNAP - 0.5, v - _SNAP - 0.5, iw, row)

@@ -1,6 +1,6 @@
 """Maps made from the journal: anew, without an agent, up to a time, or by a policy that needs the writes in order."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -10,8 +10,10 @@ from openvocab_occ._jit import in_slices
 from openvocab_occ.errors import ConfigError, MapError
 from openvocab_occ.memory import journal
 from openvocab_occ.memory._tiles_kernels import merge_rows
+from openvocab_occ.memory.cache import merged
 from openvocab_occ.memory.clock import ticks_of
 from openvocab_occ.memory.footprint import tile_rows
+from openvocab_occ.memory.foundation import PREFIX, foundation, pruned
 from openvocab_occ.memory.journal import Entry, EntryName
 from openvocab_occ.memory.layer import Layer, TileKey
 from openvocab_occ.memory.schema import CELLS, MapSchema, Tile
@@ -73,7 +75,8 @@ def rebuild(
     nobody wrote it meanwhile, by all that the journal holds then. With `out` a new map is made there, without journal.
 
     Raises:
-        ConfigError: The map has no journal, or a policy other than `newest`, or `until`, is asked for in place.
+        ConfigError: The map has no journal, or a policy other than `newest`, or `until`, is asked for in place; or
+            what is asked for needs entries that were pruned.
         MapError: A journal entry or a tile is damaged; `verify` and `repair` find and mend tiles.
     """
     fold = config or FoldConfig(policy=policy or "newest")
@@ -81,11 +84,12 @@ def rebuild(
         raise ConfigError(f"{city.store.name} has no journal", fix="create maps with journal=True")
     if out is None and (fold.policy != "newest" or until is not None):
         raise ConfigError("a map is not folded otherwise in place", expected="out, a new path", got=fold.policy)
+    barred = {*without, *(agent for agent, reason in city.agents().items() if reason)}
+    last = None if until is None else ticks_of(until)
+    pruned(city).allow(without=barred, policy=fold.policy, until=last)
     if out is None:
         for agent in without:
             city.quarantine(agent, "left out by rebuild")
-    barred = {*without, *(agent for agent, reason in city.agents().items() if reason)}
-    last = None if until is None else ticks_of(until)
     reaches = _reaches(city, journal.names(city.store, without=barred, until=last))
     if out is None:
         return sum(_in_place(city, layer, barred, reaches) for layer in city.layers())
@@ -93,11 +97,8 @@ def rebuild(
     target = TileMap.create(
         out, s.class_names, heights=s.heights, cell=s.cell, z0=s.z0, dtype=s.dtype, journal=False
     )  # fmt: skip
-    keys = sorted({key for reach in reaches for key in _box(reach)})
-    base, written = target.layers()[0], 0
-    for start in range(0, len(keys), _BLOCK):
-        block = keys[start : start + _BLOCK]
-        tiles = {key: tile for key, tile in folded(city, reaches, block, fold).items() if tile.stamps.any()}
+    base, beneath, written = target.layers()[0], foundation(city), 0
+    for tiles in _blocks(city, reaches, fold, beneath):
         base.replace(tiles)
         written += len(tiles)
     for agent in city.agents():
@@ -106,10 +107,28 @@ def rebuild(
     return written
 
 
+def folded_entries(city: TileMap, names: Collection[EntryName]) -> Iterator[dict[TileKey, Tile]]:
+    """Yield, some at a time, the tiles that some entries alone make by the rule of writes."""
+    yield from _blocks(city, _reaches(city, names), FoldConfig(), None)
+
+
+def _blocks(
+    city: TileMap, reaches: Sequence[_Reach], fold: FoldConfig, beneath: Layer | None
+) -> Iterator[dict[TileKey, Tile]]:
+    """Yield folded tiles that hold something."""
+    keys = sorted({key for reach in reaches for key in _box(reach)} | {*(beneath.stored() if beneath else ())})
+    for start in range(0, len(keys), _BLOCK):
+        tiles = folded(city, reaches, keys[start : start + _BLOCK], fold, beneath=beneath)
+        found = {key: tile for key, tile in tiles.items() if tile.stamps.any()}
+        if found:
+            yield found
+
+
 def folded(
-    city: TileMap, reaches: Sequence[_Reach], keys: Collection[TileKey], fold: FoldConfig
-) -> dict[TileKey, Tile]:
-    """Return tiles made of the entries that touch them, in order."""
+    city: TileMap, reaches: Sequence[_Reach], keys: Collection[TileKey], fold: FoldConfig, *,
+    beneath: Layer | None = None,
+) -> dict[TileKey, Tile]:  # fmt: skip
+    """Return tiles made of the entries that touch them, in order, and of what lies beneath."""
     make = _Newest if fold.policy == "newest" else _Evidence
     states = {key: make(city.schema, fold) for key in keys}
     for reach in reaches:
@@ -128,14 +147,22 @@ def folded(
                 states[key].add(found, entry, values)
 
         in_slices(add, len(work))
-    return {key: state.tile() for key, state in states.items()}
+    made = {key: state.tile() for key, state in states.items()}
+    old = beneath.read(made) if beneath else {}
+    return {key: merged([tile, old[key]]) if key in old else tile for key, tile in made.items()}
 
 
 def repair(city: TileMap, damaged: dict[str, list[TileKey]]) -> int:
     """Make damaged tiles, as `verify` lists them by layer, anew from the journal; return how many."""
     if not city.schema.journal:
         raise ConfigError(f"{city.store.name} has no journal", fix="restore the damaged chunks from a copy")
+    if damaged.get(PREFIX):
+        raise MapError(
+            f"{city.store.name}/{PREFIX} is damaged, and the entries that made it are pruned",
+            got=f"{len(damaged[PREFIX])} tiles", fix="restore them from a copy",
+        )  # fmt: skip
     barred = {agent for agent, reason in city.agents().items() if reason}
+    pruned(city).allow(without=barred)
     reaches = _reaches(city, journal.names(city.store, without=barred))
     for layer in city.layers():
         for key in damaged.get(layer.prefix, []):
@@ -171,17 +198,18 @@ def _in_place(
     city: TileMap, layer: Layer, barred: Collection[str], reaches: list[_Reach], only: Sequence[TileKey] | None = None
 ) -> int:
     """Fold the tiles of one layer, each in a transaction that fails if somebody else writes it."""
-    merged = {log for log, is_merged in city.logs().items() if is_merged}
-    logs = merged if layer.prefix == "base/" else {log for log in city.logs() if city.overlay(log) is layer}
+    in_base = {log for log, is_merged in city.logs().items() if is_merged}
+    logs = in_base if layer.prefix == "base/" else {log for log in city.logs() if city.overlay(log) is layer}
     mine = [reach for reach in reaches if reach.log in logs]
     seen = {reach.name for reach in reaches}
+    beneath = foundation(city) if layer.prefix == "base/" else None
     keys = sorted({*layer.stored(), *(key for r in mine for key in _box(r))}) if only is None else [*only]
 
     def change(key: TileKey, tile: Tile) -> int:
         # the tile has been read: whatever was put into it has been in the journal before
         late = [n for n in journal.names(city.store, without=barred) if n not in seen]
         fresh = mine + [reach for reach in _reaches(city, late) if reach.log in logs]
-        new = folded(city, sorted(fresh, key=lambda r: r.name), [key], FoldConfig())[key]
+        new = folded(city, sorted(fresh, key=lambda r: r.name), [key], FoldConfig(), beneath=beneath)[key]
         different = int((tile.record != new.record).any())
         tile.record[:] = new.record
         return different

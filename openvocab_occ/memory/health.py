@@ -7,6 +7,7 @@ from typing import Any
 from openvocab_occ.errors import MapError
 from openvocab_occ.memory import journal
 from openvocab_occ.memory.fold import check_journal
+from openvocab_occ.memory.foundation import foundation, pruned
 from openvocab_occ.memory.layer import TileKey
 from openvocab_occ.memory.schema import TILE
 from openvocab_occ.memory.tile_map import TileMap
@@ -31,7 +32,8 @@ class Health:
 
 def verify(city: TileMap, *, progress: Callable[[int, int], None] | None = None) -> Health:
     """Read every tile and every journal entry, whose checksums tell whether they are as they were written."""
-    layers = [(layer, layer.stored()) for layer in city.layers()]
+    beneath = foundation(city)
+    layers = [(layer, layer.stored()) for layer in (*city.layers(), *([beneath] if beneath else []))]
     total, done = sum(len(keys) for _, keys in layers), 0
     damaged: dict[str, list[TileKey]] = {}
     for layer, keys in layers:
@@ -74,4 +76,5 @@ def describe(city: TileMap) -> dict[str, Any]:
         "agents": city.agents(),
         "logs": city.logs(),
         "journal_entries": len(journal.names(city.store)),
+        "pruned_entries": pruned(city).entries,
     }

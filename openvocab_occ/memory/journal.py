@@ -6,7 +6,7 @@ out, and no writer waits for another. `journal/AGENT/STAMP-HASH`.
 
 import json
 import struct
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 
@@ -19,7 +19,7 @@ from openvocab_occ.geometry import GridSpec
 from openvocab_occ.memory.schema import MapSchema
 from openvocab_occ.memory.store import Store, safe_name
 
-_MAGIC = b"OVOJ\x01\x00\x00\x00"
+_MAGIC = b"OVOJ\x02\x00\x00\x00"
 _FOLDER = "journal/"
 
 
@@ -60,8 +60,18 @@ class EntryName:
         return f"{_FOLDER}{self.agent_key}/{self.stamp:016d}-{self.digest}"
 
 
-def append(store: Store, entry: Entry) -> EntryName:
-    """Write an entry; durable on return."""
+def append(store: Store, entries: Sequence[Entry]) -> None:
+    """Write entries, side by side; durable on return. Empty ones are left out."""
+    packed = [_packed(entry) for entry in entries if len(entry.flat)]
+    if packed:
+        with store.batch([name.key for name, _ in packed]) as batch:
+            for name, content in packed:
+                batch.put(name.key, content)
+            batch.commit()
+
+
+def _packed(entry: Entry) -> tuple[EntryName, bytes]:
+    """Return an entry's name and content."""
     header = {
         "agent": entry.agent, "log": entry.log, "stamp": entry.stamp, "policy": entry.policy,
         "T_world_ego": entry.T_world_ego.tolist(), "origin": entry.spec.origin, "voxel_size": entry.spec.voxel_size,
@@ -69,13 +79,11 @@ def append(store: Store, entry: Entry) -> EntryName:
     }  # fmt: skip
     mask = np.zeros(entry.spec.num_voxels, dtype=np.bool_)
     mask[entry.flat] = True
-    raw = np.packbits(mask).tobytes() + np.ascontiguousarray(entry.codes.T).tobytes()
+    raw = np.concatenate([np.packbits(mask), entry.codes.reshape(-1)])
     text = json.dumps(header).encode()
-    packed = pa.Codec("zstd", compression_level=1).compress(raw, asbytes=True)
-    content = _MAGIC + struct.pack("<II", len(text), len(raw)) + text + packed
-    name = EntryName(entry.stamp, safe_name(entry.agent, "agent"), sha256(content).hexdigest()[:32])
-    store.write(name.key, content)
-    return name
+    body = pa.Codec("zstd", compression_level=1).compress(raw, asbytes=True)
+    content = b"".join((_MAGIC, struct.pack("<II", len(text), len(raw)), text, body))
+    return EntryName(entry.stamp, safe_name(entry.agent, "agent"), sha256(content).hexdigest()[:32]), content
 
 
 def names(store: Store, *, without: Collection[str] = (), until: int | None = None) -> list[EntryName]:
@@ -109,9 +117,9 @@ def load(store: Store, name: EntryName, schema: MapSchema) -> Entry:
         spec = GridSpec(tuple(head["origin"]), _size(head["voxel_size"]), tuple(head["shape"]))
         bits = -(-spec.num_voxels // 8)
         flat = np.flatnonzero(np.unpackbits(raw[:bits], count=spec.num_voxels))
-        codes = raw[bits:].reshape(schema.payload, len(flat)).T
+        codes = raw[bits:].reshape(len(flat), schema.payload)
         return Entry(
-            np.asarray(head["T_world_ego"], dtype=np.float64), spec, flat, np.ascontiguousarray(codes),
+            np.asarray(head["T_world_ego"], dtype=np.float64), spec, flat, codes,
             int(head["stamp"]), str(head["agent"]), str(head["log"]), str(head["policy"]),
         )  # fmt: skip
     except (ValueError, KeyError, TypeError, struct.error, pa.ArrowException) as error:

@@ -5,14 +5,15 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, cast
 
-import numpy as np
-import tensorstore as ts
-
 from openvocab_occ._jit import in_slices
 from openvocab_occ.errors import StorageError
-from openvocab_occ.memory._codec_kernels import transposed
-from openvocab_occ.memory.schema import ORIGIN, SHAPE, TILE, MapSchema, Tile
-from openvocab_occ.memory.store import Conflict, Store, translated
+from openvocab_occ.memory._tiles_kernels import merge_tiles
+from openvocab_occ.memory.chunk import array_metadata, chunk_of, record_of
+from openvocab_occ.memory.commit import Batch
+from openvocab_occ.memory.recent import Recent
+from openvocab_occ.memory.refusals import translated
+from openvocab_occ.memory.schema import ORIGIN, MapSchema, Tile
+from openvocab_occ.memory.store import Store
 
 _ATTEMPTS = 60
 _WAIT = 0.004  # s, doubled up to 64 times for each conflict; a commit takes about ten milliseconds
@@ -26,6 +27,15 @@ class TileKey(NamedTuple):
     y: int
 
 
+class Stored(NamedTuple):
+    """What a store says of a chunk."""
+
+    version: bytes
+    value: bytes | None
+    """None where it is absent, or still of the version that the asker knows."""
+    absent: bool
+
+
 Change = Callable[[TileKey, Tile], int]
 """Alters a tile and returns how many records it changed; called again, on a fresh tile, after a lost race."""
 
@@ -33,140 +43,147 @@ Change = Callable[[TileKey, Tile], int]
 class Layer:
     """Tiles of one array. Reads see whole chunks; an update of a chunk is never lost to another writer."""
 
-    def __init__(self, store: Store, prefix: str, schema: MapSchema) -> None:
+    def __init__(self, store: Store, prefix: str, schema: MapSchema, recent: Recent | None = None) -> None:
         self.prefix = prefix
         self.schema = schema
         self._store = store
         self._where = f"{store.name}/{prefix}".rstrip("/")
-        spec = {"driver": "zarr3", "kvstore": store.under(prefix), "metadata": array_metadata(schema)}
-        with translated(self._where):
-            options = {"open": True, "create": True, "context": store.context, "recheck_cached_data": True}
-            self._array: Any = cast(Any, ts.open(spec, **options).result())
-        self._kv: Any = self._array.kvstore
+        self._kv: Any = cast(Any, store.kv)
+        self._recent = recent or Recent()
+        if store.read(f"{prefix}zarr.json") is None:
+            store.write_json(f"{prefix}zarr.json", array_metadata(schema))
 
-    def generation(self, keys: Iterable[TileKey], known: dict[TileKey, bytes]) -> dict[TileKey, bytes | None]:
-        """Return what version of each tile is stored, None if absent; `known` are versions seen before."""
+    def fetch(self, keys: Iterable[TileKey], known: Mapping[TileKey, bytes] | None = None) -> dict[TileKey, Stored]:
+        """Return what is stored of each tile; no value where its version is the `known` one."""
+        versions = known or {}
         with translated(self._where):
-            futures = [(key, self._kv.read(chunk_name(key), if_not_equal=known.get(key))) for key in keys]
+            futures = [(key, self._kv.read(self._name(key), if_not_equal=versions.get(key))) for key in keys]
             found = [(key, future.result()) for key, future in futures]
-        return {
-            key: known[key]
-            if result.state == "unspecified"
-            else (result.stamp.generation if result.state == "value" else None)
-            for key, result in found
-        }
+        chunks: dict[TileKey, Stored] = {}
+        for key, result in found:
+            if result.state == "unspecified":
+                chunks[key] = Stored(versions[key], None, absent=False)
+            else:
+                absent = result.state == "missing"
+                chunks[key] = Stored(result.stamp.generation, None if absent else result.value, absent)
+        return chunks
 
     def stored(self) -> list[TileKey]:
         """Return the tiles that are stored, sorted. Lists the whole layer."""
-        with translated(self._where):
-            names = [name.decode() for name in self._kv.list().result()]
-        chunks = [name.split(".")[1:] for name in names if name.startswith("c.") and name.count(".") == 4]
+        names = [name.removeprefix(self.prefix) for name in self._store.list(f"{self.prefix}c.")]
+        chunks = [name.split(".")[1:] for name in names if name.count(".") == 4]
         return sorted(
             TileKey(int(f) - ORIGIN[0], int(x) - ORIGIN[1], int(y) - ORIGIN[2])
-            for f, _, x, y in chunks
-            if y.isdigit()  # not a lock file
+            for f, x, y, last in chunks
+            if last == "0"
         )
 
     def sizes(self) -> dict[TileKey, int]:
         """Return the compressed bytes of each stored tile."""
-        with translated(self._where):
-            futures = [(key, self._kv.read(chunk_name(key))) for key in self.stored()]
-            return {key: len(future.result().value) for key, future in futures}
+        return {key: len(found.value or b"") for key, found in self.fetch(self.stored()).items()}
 
-    def read(self, keys: Iterable[TileKey], *, into: Mapping[TileKey, np.ndarray] | None = None) -> dict[TileKey, Tile]:
-        """Return tiles; those never written are empty. Those that `into` has a record for are read into that.
+    def read(self, keys: Iterable[TileKey]) -> dict[TileKey, Tile]:
+        """Return tiles, not to be altered; those never written are empty.
 
         Raises:
             MapError: A stored tile is damaged.
         """
-        wanted = [*keys]
-        futures = [_part(self._array, key).read(order="C") for key in wanted]
-        given = into or {}
-        tiles = [Tile(self.schema, given[key] if key in given else self._record()) for key in wanted]
+        found = [*self.fetch(keys).items()]
+        tiles: dict[TileKey, Tile] = {}
 
-        def unpack(start: int, stop: int) -> None:
-            for n in range(start, stop):
-                with translated(self._at(wanted[n])):
-                    transposed(_words(futures[n].result()), tiles[n].record.view("<u8"))
+        def decode(start: int, stop: int) -> None:
+            for key, stored in found[start:stop]:
+                tiles[key] = self.tile(key, stored.value)
 
-        in_slices(unpack, len(wanted))
-        return dict(zip(wanted, tiles, strict=True))
+        in_slices(decode, len(found))
+        return {key: tiles[key] for key, _ in found}
 
-    def update(self, keys: Iterable[TileKey], change: Change) -> int:
+    def tile(self, key: TileKey, value: bytes | None) -> Tile:
+        """Return a stored chunk as a tile, not to be altered; an empty one for None."""
+        return Tile(self.schema, None if value is None else record_of(value, self.schema, self._at(key)))
+
+    def update(self, keys: Iterable[TileKey], change: Change, *, first: Callable[[], object] | None = None) -> int:
         """Read tiles, let `change` alter them, and commit; durable on return. Return how many records changed.
 
         Each tile is committed whole or not at all, and only if nobody wrote it in between. When some were written by
-        others the rest is committed and those are done again: `change` must bear that.
+        others the rest is committed and those are done again: `change` must bear that. `first` is called before
+        anything is committed, and stops it by raising.
 
         Raises:
             MapError: A stored tile is damaged; nothing is written over it.
             StorageError: The store is full or read-only, or too many writers fight over a tile.
         """
-        wanted = [*keys]
-        counts = dict.fromkeys(wanted, 0)
+        wanted = {self._name(key): key for key in keys}
+        total = 0
         for attempt in range(_ATTEMPTS):
-            transaction = ts.Transaction(repeatable_read=True)
-            try:
-                with self._store.locked([f"{self.prefix}{chunk_name(key)}" for key in wanted]):
-                    changed = self._stage(transaction, wanted, change)
-                    for key, count in changed.items():
-                        counts[key] = max(counts[key], count)
-                    if any(changed.values()):
-                        with translated(self._where):
-                            transaction.commit_async().result()
-                    else:
-                        transaction.abort()
-                return sum(counts.values())
-            except Conflict:  # in a bucket, or with a writer that is not ours
-                transaction.abort()
-                time.sleep(random.random() * _WAIT * 2 ** min(attempt, 6))
-            except BaseException:
-                transaction.abort()
-                raise
+            with self._store.batch([*wanted]) as batch:
+                altered = self._stage(batch, [*wanted.values()], change)
+                if first is not None:
+                    first()
+                lost = batch.commit()
+            done = {name: altered[key] for name, key in wanted.items() if name not in lost}
+            total += sum(count for _, _, count in done.values())
+            self._recent.keep({name: (chunk, tile) for name, (chunk, tile, _) in done.items() if chunk})
+            if not lost:
+                return total
+            wanted = {name: wanted[name] for name in lost}
+            time.sleep(random.random() * _WAIT * 2 ** min(attempt, 6))
         raise StorageError(
             f"{self._where} is fought over", expected=f"a commit within {_ATTEMPTS} tries", fix="write less often"
         )
 
+    def merge(self, tiles: Mapping[TileKey, Tile]) -> int:
+        """Put tiles in where their records are the greater ones, durably; return how many records changed."""
+
+        def change(key: TileKey, tile: Tile) -> int:
+            new = tiles[key]
+            return merge_tiles(new.stamps, new.writers, new.payload, tile.stamps, tile.writers, tile.payload)
+
+        return self.update(tiles, change)
+
     def drop(self, key: TileKey) -> None:
         """Remove a tile."""
-        with self._store.locked([f"{self.prefix}{chunk_name(key)}"]), translated(self._at(key)):
-            self._kv.write(chunk_name(key), None).result()
+        with self._store.batch([self._name(key)]), translated(self._at(key)):
+            self._kv.write(self._name(key), None).result()
 
     def replace(self, tiles: dict[TileKey, Tile]) -> None:
         """Write tiles as they are, whatever was there; durable on return."""
-        with self._store.locked([f"{self.prefix}{chunk_name(key)}" for key in tiles]), translated(self._where):
-            futures = [_part(self._array, key).write(self._packed(tile)) for key, tile in tiles.items()]
-            for future in futures:
-                future.result()
+        with self._store.batch([self._name(key) for key in tiles]) as batch:
+            work = [*tiles.items()]
 
-    def _stage(self, transaction: Any, keys: list[TileKey], change: Change) -> dict[TileKey, int]:
-        """Put the changed tiles into a transaction; return the records changed of each."""
-        array = self._array.with_transaction(transaction)
-        futures = [_part(array, key).read(order="C") for key in keys]
-        counts: dict[TileKey, int] = {}
+            def put(start: int, stop: int) -> None:
+                for key, tile in work[start:stop]:
+                    batch.put(self._name(key), chunk_of(tile))
+
+            in_slices(put, len(work))
+            batch.commit()
+
+    def _stage(self, batch: Batch, keys: list[TileKey], change: Change) -> dict[TileKey, tuple[bytes, Tile, int]]:
+        """Alter tiles and put them into a batch; return of each chunk, tile and records changed."""
+        found = self.fetch(keys)
+        done: dict[TileKey, tuple[bytes, Tile, int]] = {}
 
         def alter(start: int, stop: int) -> None:
-            for n in range(start, stop):
-                tile = Tile(self.schema, self._record())
-                with translated(self._at(keys[n])):
-                    transposed(_words(futures[n].result()), tile.record.view("<u8"))
-                counts[keys[n]] = change(keys[n], tile)
-                if counts[keys[n]]:
-                    with translated(self._at(keys[n])):
-                        _part(array, keys[n]).write(
-                            self._packed(tile), can_reference_source_data_indefinitely=True
-                        ).result()
+            for key in keys[start:stop]:
+                value = found[key].value
+                tile = self._own(key, value)
+                count = change(key, tile)
+                if count:
+                    value = chunk_of(tile)
+                    batch.put(self._name(key), value, found[key].version)
+                done[key] = value or b"", tile, count
 
         in_slices(alter, len(keys))
-        return counts
+        return done
 
-    def _record(self) -> np.ndarray:
-        return np.empty((TILE * TILE, self.schema.planes), np.uint8)
+    def _own(self, key: TileKey, value: bytes | None) -> Tile:
+        """Return a stored chunk as a tile that may be altered."""
+        if value is None:
+            return Tile(self.schema)
+        return self._recent.take(self._name(key), value) or self.tile(key, value).copy()
 
-    def _packed(self, tile: Tile) -> np.ndarray:
-        planes = np.empty((self.schema.planes, TILE * TILE), np.uint8)
-        transposed(tile.record.view("<u8"), planes.view("<u8"))
-        return planes.reshape(-1, TILE, TILE)
+    def _name(self, key: TileKey) -> str:
+        return f"{self.prefix}{chunk_name(key)}"
 
     def _at(self, key: TileKey) -> str:
         return f"{self._where}/{chunk_name(key)}"
@@ -174,33 +191,4 @@ class Layer:
 
 def chunk_name(key: TileKey) -> str:
     """Return the name of a tile's chunk in its array."""
-    return f"c.{key.floor + ORIGIN[0]}.0.{key.x + ORIGIN[1]}.{key.y + ORIGIN[2]}"
-
-
-def array_metadata(schema: MapSchema) -> dict[str, Any]:
-    """Return the Zarr v3 metadata of a layer."""
-    codecs: list[dict[str, Any]] = [
-        {"name": "bytes"},
-        {"name": "zstd", "configuration": {"level": 1, "checksum": False}},
-        {"name": "crc32c"},
-    ]
-    return {
-        "shape": [SHAPE[0], schema.planes, SHAPE[1] * TILE, SHAPE[2] * TILE],
-        "data_type": "uint8",
-        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [1, schema.planes, TILE, TILE]}},
-        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "."}},
-        "fill_value": 0,
-        "codecs": codecs,
-        "dimension_names": ["floor", "plane", "x", "y"],
-        "attributes": schema.attributes(),
-    }
-
-
-def _part(array: Any, key: TileKey) -> Any:
-    x, y = (key.x + ORIGIN[1]) * TILE, (key.y + ORIGIN[2]) * TILE
-    return array[key.floor + ORIGIN[0], :, x : x + TILE, y : y + TILE]
-
-
-def _words(planes: np.ndarray) -> np.ndarray:
-    """Return planes as rows of eight bytes each."""
-    return planes.reshape(len(planes), TILE * TILE).view("<u8")
+    return f"c.{key.floor + ORIGIN[0]}.{key.x + ORIGIN[1]}.{key.y + ORIGIN[2]}.0"

@@ -8,11 +8,11 @@ from jaxtyping import Float64, Int64, UInt32
 
 from openvocab_occ.errors import ConfigError
 from openvocab_occ.memory import journal
-from openvocab_occ.memory._tiles_kernels import merge_tiles
 from openvocab_occ.memory.changes import centers
 from openvocab_occ.memory.footprint import tile_rows
-from openvocab_occ.memory.layer import Layer, TileKey
-from openvocab_occ.memory.schema import CELLS, Tile
+from openvocab_occ.memory.foundation import merge_pruned
+from openvocab_occ.memory.layer import TileKey
+from openvocab_occ.memory.schema import CELLS
 from openvocab_occ.memory.store import agent_number
 from openvocab_occ.memory.tile_map import TileMap
 
@@ -65,7 +65,7 @@ def merge(target: TileMap, source: TileMap) -> int:
     for theirs, mine in pairs:
         keys = theirs.stored()
         for start in range(0, len(keys), 32):
-            put_tiles(mine, theirs.read(keys[start : start + 32]))
+            mine.merge(theirs.read(keys[start : start + 32]))
         touched += len(keys)
     for log, into_base in merged.items():
         if into_base and log not in ours:
@@ -80,20 +80,11 @@ def merge_journal(target: TileMap, source: TileMap) -> None:
             target.admit(agent)
         if reason:
             target.quarantine(agent, reason)
+    merge_pruned(target, source)
     for name in journal.names(source.store):
         content = source.store.read(name.key)
         if content is not None:
             target.store.write(name.key, content)
-
-
-def put_tiles(layer: Layer, tiles: dict[TileKey, Tile]) -> int:
-    """Merge tiles into a layer, durably; return how many records changed."""
-
-    def change(key: TileKey, tile: Tile) -> int:
-        new = tiles[key]
-        return merge_tiles(new.stamps, new.writers, new.payload, tile.stamps, tile.writers, tile.payload)
-
-    return layer.update(tiles, change)
 
 
 @dataclass(frozen=True, eq=False)

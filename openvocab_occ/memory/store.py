@@ -1,6 +1,5 @@
 """Where a map's bytes lie: a folder, or a bucket. Small values, and the one place that knows TensorStore's errors."""
 
-import errno
 import json
 import os
 import re
@@ -14,8 +13,10 @@ from zlib import crc32
 
 import tensorstore as ts
 
-from openvocab_occ.errors import ConfigError, DataError, MapError, NotFoundError, OpenVocabOccError, StorageError
+from openvocab_occ.errors import ConfigError, MapError, StorageError
 from openvocab_occ.io.files import PathLike
+from openvocab_occ.memory.commit import SCRATCH, Batch, BucketBatch, FolderBatch, make_folders
+from openvocab_occ.memory.refusals import refused, translated
 
 try:
     import fcntl
@@ -27,22 +28,6 @@ Location = PathLike | Mapping[str, Any]
 
 _LOCKS = ".locks"
 _NUM_LOCKS = 64  # files; tiles that share one wait for each other in vain, rarely
-_FULL = ("os_error_code='27'", "os_error_code='28'", "os_error_code='122'", "No space left", "RESOURCE_EXHAUSTED")
-_READ_ONLY = ("os_error_code='13'", "os_error_code='30'", "os_error_code='1'", "PERMISSION_DENIED", "AccessDenied")
-_DAMAGED = (
-    "DATA_LOSS",
-    "Truncated",
-    "Error decoding",
-    "CRC",
-    "checksum",
-    "corrupt",
-    "INVALID_ARGUMENT",
-    "FAILED_PRECONDITION",
-)
-
-
-class Conflict(Exception):
-    """Another writer was faster; read again and try again. Never leaves this package."""
 
 
 class Store:
@@ -67,29 +52,29 @@ class Store:
 
     def write(self, key: str, value: bytes) -> None:
         """Write a value, whole and durable, or raise and leave what was there."""
-        with self.locked([key]), translated(f"{self.name}/{key}"):
-            self.kv.write(key, value).result()
+        with self.batch([key]) as batch:
+            batch.put(key, value)
+            batch.commit()
 
     @contextmanager
-    def locked(self, keys: Collection[str]) -> Iterator[None]:
-        """Keep other processes from writing these keys, in a folder; a killed holder's locks open by themselves.
+    def batch(self, keys: Collection[str]) -> Iterator[Batch]:
+        """Let values of some of `keys` be read, put and committed; in a folder other processes wait for that long.
 
-        TensorStore writes to KEY.__lock and renames it, and goes on with one that a killed process left without
-        cutting it off first: a shorter value gets the tail of the longer one. So what is left is removed here.
+        A killed process's locks open by themselves, and what it left half written is written over.
         """
         if self.folder is None or fcntl is None:
-            yield
+            yield BucketBatch(self.kv, self.name)
             return
-        with ExitStack() as held, refused(self.name):
-            folder = self.folder / _LOCKS
-            folder.mkdir(exist_ok=True)
-            for number in sorted({crc32(key.encode()) % _NUM_LOCKS for key in keys}):  # in order: no two wait in a ring
-                descriptor = os.open(folder / f"{number:02x}", os.O_RDWR | os.O_CREAT, 0o666)
-                held.callback(os.close, descriptor)
-                fcntl.flock(descriptor, fcntl.LOCK_EX)
-            for key in keys:
-                (self.folder / f"{key}.__lock").unlink(missing_ok=True)
-            yield
+        with ExitStack() as held:
+            with refused(self.name):
+                make_folders(self.folder, [f"{_LOCKS}/any", *keys])
+                for lock in sorted({_lock(key) for key in keys}):  # in order: no two wait in a ring
+                    descriptor = os.open(self.folder / _LOCKS / lock, os.O_RDWR | os.O_CREAT, 0o666)
+                    held.callback(os.close, descriptor)
+                    fcntl.flock(descriptor, fcntl.LOCK_EX)
+            batch = FolderBatch(self.folder, self.name)
+            held.callback(batch.close)
+            yield batch
 
     def delete(self, prefix: str) -> None:
         """Remove every key that begins with `prefix`."""
@@ -100,7 +85,7 @@ class Store:
         """Return the keys that begin with `prefix`, sorted; those that a writer is still busy with are left out."""
         with translated(f"{self.name}/{prefix}"):
             keys = self.kv.list(ts.KvStore.KeyRange(prefix, prefix + "\x7f")).result()
-        return sorted(key.decode() for key in keys if not key.endswith(b".__lock"))
+        return sorted(key.decode() for key in keys if not key.endswith(SCRATCH.encode()))
 
     def read_json(self, key: str) -> dict[str, Any] | None:
         """Return a JSON object, or None if there is none."""
@@ -136,42 +121,9 @@ def agent_number(name: str) -> int:
     return int.from_bytes(sha256(name.encode()).digest()[:4], "little") or 1
 
 
-@contextmanager
-def refused(what: str) -> Iterator[None]:
-    """Turn the operating system's refusal into an error of ours."""
-    try:
-        yield
-    except (PermissionError, OSError) as error:
-        if isinstance(error, OpenVocabOccError):
-            raise
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        why = "the disk is full" if full else "it is read-only"
-        fix = "make room, then write again" if full else "check its permissions"
-        raise StorageError(f"{what} cannot be written: {why}", got=error.strerror, fix=fix) from error
-
-
-@contextmanager
-def translated(what: str) -> Iterator[None]:
-    """Turn an error of TensorStore into one of ours."""
-    try:
-        yield
-    except (DataError, StorageError, NotFoundError, Conflict):
-        raise
-    except (ValueError, OSError) as error:
-        text = str(error)
-        if text.startswith("ABORTED"):
-            raise Conflict(text) from error
-        brief = re.sub(r" \[tensorstore_spec.*|\[source locations.*", "", text, flags=re.DOTALL)[:300]
-        if any(sign in text for sign in _FULL):
-            fix = "make room, then write again; what was stored before is intact"
-            raise StorageError(f"{what} cannot be written: the disk is full", got=brief, fix=fix) from error
-        if any(sign in text for sign in _READ_ONLY):
-            fix = "check its permissions"
-            raise StorageError(f"{what} cannot be written: it is read-only", got=brief, fix=fix) from error
-        if any(sign in text for sign in _DAMAGED):
-            fix = "openvocab-occ memory verify lists what is damaged, memory rebuild --repair makes it anew"
-            raise MapError(f"{what} is damaged", expected="a whole chunk", got=brief, fix=fix) from error
-        raise StorageError(f"{what} cannot be used", got=brief) from error
+def _lock(key: str) -> str:
+    """Return the file that is locked for a key; the journal has its own, as it is written while tiles are locked."""
+    return f"{key.partition('/')[0]}-{crc32(key.encode()) % _NUM_LOCKS:02x}"
 
 
 def _spec(location: Location) -> tuple[dict[str, Any], str, Path | None]:

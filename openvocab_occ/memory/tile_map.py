@@ -14,11 +14,12 @@ from openvocab_occ.arrays import ArrayLike, check_shape
 from openvocab_occ.errors import AlreadyExistsError, ConfigError, DataError, NotFoundError, StorageError
 from openvocab_occ.geometry import GridSpec
 from openvocab_occ.memory import journal
-from openvocab_occ.memory._tiles_kernels import gather, merge_rows, merge_tiles
+from openvocab_occ.memory._tiles_kernels import gather, merge_rows
 from openvocab_occ.memory.cache import TileCache, merged
 from openvocab_occ.memory.clock import fading_rate, ticks_of
 from openvocab_occ.memory.footprint import tile_rows
 from openvocab_occ.memory.layer import Layer, TileKey
+from openvocab_occ.memory.recent import Recent
 from openvocab_occ.memory.schema import LEVELS, DType, MapSchema, Tile
 from openvocab_occ.memory.store import Location, Store, agent_number, safe_name
 from openvocab_occ.memory.window import Prior, Window
@@ -54,6 +55,7 @@ class TileMap:
         self.schema = schema
         self.writable = writable
         self._layers: dict[str, Layer] = {}
+        self._recent = Recent()
         self._cache = TileCache(schema, cache_bytes)
         self._lock = threading.RLock()
 
@@ -143,7 +145,7 @@ class TileMap:
         affine = window.to_lattice
         with self._lock:
             cache = self._cache
-            table = cache.load(window.tiles(), layers).reshape(window.counts)
+            table = window.table(cache.load(window.tiles(), layers))
             in_slices(
                 lambda start, stop: gather(
                     affine, table, cache.values, cache.stamps, levels, fading, interpolation == "bilinear", start, stop,
@@ -229,36 +231,31 @@ class TileMap:
         ticks = ticks_of(stamp)
         safe_name(log, "log")
         safe_name(agent, "agent")
-        flat = np.flatnonzero(mask)
-        codes = self.schema.encode(logits.reshape(-1, logits.shape[-1])[flat])
+        flat, codes = self.schema.encode_seen(logits.reshape(-1, logits.shape[-1]), mask.reshape(-1))
         return journal.Entry(window.T_world_ego, spec, flat, codes, ticks, agent, log, policy)
 
     def put(self, entries: Sequence[journal.Entry]) -> Written:
         """Write what was prepared, all of one log and in this order, as `write` does; each tile is committed once."""
         for agent in {entry.agent for entry in entries}:
             self.admit(agent)
-        if self.schema.journal:
-            for entry in entries:
-                if len(entry.flat):
-                    journal.append(self.store, entry)
-        return self.apply(entries)
+        with ThreadPoolExecutor(max_workers=1, thread_name_prefix="journal") as aside:
+            kept = aside.submit(journal.append, self.store, entries if self.schema.journal else [])
+            footprints = [(entry, tile_rows(entry, self.schema)) for entry in entries]
+            keys = dict.fromkeys(key for _, rows in footprints for key in rows)
 
-    def apply(self, entries: Sequence[journal.Entry]) -> Written:
-        """Put writes of one log into the tiles, without journal."""
-        footprints = [(entry, tile_rows(entry, self.schema)) for entry in entries]
-        keys = dict.fromkeys(key for _, rows in footprints for key in rows)
+            def change(key: TileKey, tile: Tile) -> int:
+                return sum(
+                    merge_rows(
+                        rows[key], entry.codes, np.uint64(entry.stamp), np.uint32(agent_number(entry.agent)),
+                        entry.policy == "replace", tile.stamps, tile.writers, tile.payload,
+                    )
+                    for entry, rows in footprints if key in rows
+                )  # fmt: skip
 
-        def change(key: TileKey, tile: Tile) -> int:
-            return sum(
-                merge_rows(
-                    rows[key], entry.codes, np.uint64(entry.stamp), np.uint32(agent_number(entry.agent)),
-                    entry.policy == "replace", tile.stamps, tile.writers, tile.payload,
-                )
-                for entry, rows in footprints if key in rows
-            )  # fmt: skip
-
-        changed = self.overlay(entries[0].log).update(keys, change) if keys else 0
-        reached = sum(int((part >= 0).sum()) for _, rows in footprints for part in rows.values())
+            # what is in a tile is in the journal
+            changed = self.overlay(entries[0].log).update(keys, change, first=kept.result) if keys else 0
+            kept.result()
+        reached = sum(int(np.count_nonzero(part >= 0)) for _, rows in footprints for part in rows.values())
         return Written(reached, changed, len(keys))
 
     def admit(self, agent: str) -> None:
@@ -322,16 +319,10 @@ class TileMap:
         """
         if log not in self.logs():
             raise NotFoundError(f"there is no log {log!r}", expected=f"one of {sorted(self.logs())}")
-        source = self._layer(_overlay(log))
+        source, base = self._layer(_overlay(log)), self._layer(_BASE)
         keys = source.stored()
         for start in range(0, len(keys), 32):
-            tiles = source.read(keys[start : start + 32])
-
-            def change(key: TileKey, tile: Tile, tiles: dict[TileKey, Tile] = tiles) -> int:
-                new = tiles[key]
-                return merge_tiles(new.stamps, new.writers, new.payload, tile.stamps, tile.writers, tile.payload)
-
-            self._layer(_BASE).update(tiles, change)
+            base.merge(source.read(keys[start : start + 32]))
         self.mark_consolidated(log)
         self.store.delete(f"{_overlay(log)}c.")
         return len(keys)
@@ -366,7 +357,7 @@ class TileMap:
     def _layer(self, prefix: str) -> Layer:
         with self._lock:
             if prefix not in self._layers:
-                self._layers[prefix] = Layer(self.store, prefix, self.schema)
+                self._layers[prefix] = Layer(self.store, prefix, self.schema, self._recent)
             return self._layers[prefix]
 
 

@@ -1,9 +1,10 @@
 """Geometry between a posed local grid and the lattice of tiles."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int32
 
 from openvocab_occ.arrays import ArrayLike
 from openvocab_occ.errors import GridError, PoseError
@@ -11,6 +12,7 @@ from openvocab_occ.geometry import GridSpec, as_pose, invert
 from openvocab_occ.memory.layer import TileKey
 from openvocab_occ.memory.schema import ORIGIN, SHAPE, TILE, MapSchema
 
+_SNAP = 0.01  # cells; more than what rounding does to a plane between two floors
 _MOST_TILES = 100_000  # 32 GB of them; more is a wrong spec
 
 
@@ -38,8 +40,11 @@ class Window:
         shift = corner / schema.cell
         ends = np.stack(np.meshgrid(*([0.0, n] for n in spec.shape), indexing="ij"), axis=-1).reshape(-1, 3)
         lattice = ends @ self._matrix.T + shift
-        low = np.floor((lattice.min(axis=0) - 1) / self._span).astype(np.int64)  # one cell more for bilinear
-        high = np.floor((lattice.max(axis=0) + 1) / self._span).astype(np.int64)
+        reach = np.array([1.0, 1.0, _SNAP])  # bilinear looks one cell further in x and y
+        # a map voxel is reached from the middle of it, or by the middle of a voxel of the grid: not by a touch
+        half = np.minimum(np.abs(self._matrix).sum(axis=1), 1.0) / 2
+        low = np.floor((lattice.min(axis=0) + half - reach) / self._span).astype(np.int64)
+        high = np.floor((lattice.max(axis=0) - half + reach) / self._span).astype(np.int64)
         limits = np.array([ORIGIN[1], ORIGIN[2], ORIGIN[0]])
         if (np.abs(np.stack([low, high])) >= limits - 1).any():
             raise PoseError(
@@ -67,5 +72,18 @@ class Window:
         return np.column_stack([back[:3, :3] * self.schema.cell, local]) / self.spec.size[:, None]
 
     def tiles(self) -> list[TileKey]:
-        """Return every tile that the box around the grid touches."""
-        return [TileKey(self.low.floor + f, self.low.x + x, self.low.y + y) for f, x, y in np.ndindex(*self.counts)]
+        """Return every tile that the grid touches, or bilinear reading near it."""
+        corner = np.array(list(np.ndindex(*self.counts)))[:, [1, 2, 0]] * self._span
+        back = np.linalg.inv(self._matrix)  # lattice to grid
+        ends = np.stack(np.meshgrid(*([-1.0, n + 1] for n in self._span), indexing="ij"), axis=-1).reshape(-1, 3)
+        local = (corner[:, None] + ends - self._shift) @ back.T
+        touched = ((local.max(axis=1) >= 0) & (local.min(axis=1) <= self.spec.shape)).all(axis=1)
+        at = corner[touched] // self._span
+        return [TileKey(self.low.floor + int(f), self.low.x + int(x), self.low.y + int(y)) for x, y, f in at]
+
+    def table(self, slots: Mapping[TileKey, int]) -> Int32[np.ndarray, "floors nx ny"]:
+        """Return the slots of tiles by floor, x and y from the first; -1 where there is none."""
+        out = np.full(self.counts, -1, dtype=np.int32)
+        for key, slot in slots.items():
+            out[key.floor - self.low.floor, key.x - self.low.x, key.y - self.low.y] = slot
+        return out

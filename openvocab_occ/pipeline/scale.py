@@ -23,7 +23,7 @@ from openvocab_occ.errors import ConfigError, DataError, MissingExtraError, NotF
 from openvocab_occ.memory import TileMap
 from openvocab_occ.memory.cache import merged
 from openvocab_occ.memory.layer import TileKey
-from openvocab_occ.memory.merge import merge_journal, put_tiles
+from openvocab_occ.memory.merge import merge_journal
 from openvocab_occ.memory.observe import observe
 from openvocab_occ.memory.schema import MapSchema
 from openvocab_occ.memory.writer import Writer
@@ -197,7 +197,7 @@ def run_log(job: LogJob, scratch: str) -> LogResult:
 def reduce_tile(out: str, sources: Sequence[str], key: TileKey) -> int:
     """Merge one tile of several maps into a city; return how many records changed."""
     parts = [tile for path in sources for _, tile in TileMap.open(path, writable=False).tiles(keys=[key])]
-    return put_tiles(TileMap.open(out).layers()[0], {key: merged(parts)}) if parts else 0
+    return TileMap.open(out).layers()[0].merge({key: merged(parts)}) if parts else 0
 
 
 def _of_grid(path: str, grid: OccupancyGrid | None) -> TileMap:

@@ -8,6 +8,8 @@ import pytest
 
 from openvocab_occ.geometry import GridSpec, matrix_from_wxyz
 from openvocab_occ.memory import TileMap
+from openvocab_occ.memory.layer import TileKey
+from openvocab_occ.memory.schema import CELLS, TILE
 
 NAMES = ("car", "manmade", "vegetation", "free")
 SPEC = GridSpec((-4.0, -4.8, -1.0), 0.4, (20, 24, 8))
@@ -45,3 +47,19 @@ def probabilities(logits: np.ndarray) -> np.ndarray:
 
 def centred(logits: np.ndarray) -> np.ndarray:
     return logits - logits.mean(axis=-1, keepdims=True)
+
+
+def write(city, logits, mask, T, *, spec=SPEC, stamp=100.0, agent="a", log="one", **more):
+    return city.write(logits, mask, T, spec, stamp=stamp, agent=agent, log=log, **more)
+
+
+def contents(city: TileMap) -> dict[TileKey, bytes]:
+    return {key: tile.record.tobytes() for key, tile in city.tiles() if tile.stamps.any()}
+
+
+def voxel_centers(city: TileMap, key: TileKey) -> np.ndarray:
+    """World coordinates [cells, heights, 3] of the voxels of a tile."""
+    h, cell = city.schema.heights, city.schema.cell
+    x, y, z = np.meshgrid(np.arange(TILE), np.arange(TILE), np.arange(h), indexing="ij")
+    index = np.stack([x, y, z], -1) + np.array([key.x * TILE, key.y * TILE, key.floor * h]) + 0.5
+    return (index * cell + [0, 0, city.schema.z0]).reshape(CELLS, h, 3)

@@ -8,8 +8,7 @@ import pytest
 
 from openvocab_occ.memory import TileMap
 from openvocab_occ.memory.health import verify
-from tests.memory.conftest import NAMES, SPEC, random_logits, random_pose
-from tests.memory.test_tile_map import contents, write
+from tests.memory.conftest import NAMES, SPEC, contents, random_logits, random_pose, write
 
 
 @pytest.fixture

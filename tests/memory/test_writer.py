@@ -10,8 +10,7 @@ from openvocab_occ.geometry import GridSpec, pose
 from openvocab_occ.memory import TileMap
 from openvocab_occ.memory.nmp import NMP_CITIES, NmpMap
 from openvocab_occ.memory.writer import Writer
-from tests.memory.conftest import NAMES, SPEC, random_logits, random_pose
-from tests.memory.test_tile_map import contents, write
+from tests.memory.conftest import NAMES, SPEC, contents, random_logits, random_pose, write
 
 
 def drive(rng, count=9):

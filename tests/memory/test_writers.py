@@ -10,11 +10,10 @@ import pytest
 
 from openvocab_occ.errors import MapError, StorageError
 from openvocab_occ.evaluation.memory_stress import CLASSES, Stress, fight, kill
-from openvocab_occ.memory import TileMap
+from openvocab_occ.memory import TileMap, store
 from openvocab_occ.memory.fold import repair
 from openvocab_occ.memory.health import verify
-from tests.memory.conftest import NAMES, SPEC, random_logits
-from tests.memory.test_tile_map import contents, write
+from tests.memory.conftest import NAMES, SPEC, contents, random_logits, write
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -54,7 +53,7 @@ def test_torn_chunks_are_told_and_made_anew(city, rng):
     whole = chunk.read_bytes()
     for damage in (whole[: len(whole) // 2], b"", bytes([whole[0] ^ 1]) + whole[1:], whole[:-9] + b"\x00" + whole[-8:]):
         chunk.write_bytes(damage)
-        with pytest.raises(MapError, match=r"logs/one/c\.512\.0\.\d+\.\d+ is damaged.*memory verify"):
+        with pytest.raises(MapError, match=r"logs/one/c\.512\.\d+\.\d+\.0 is damaged.*memory verify"):
             city.read(np.eye(4), SPEC)
         with pytest.raises(MapError, match="is damaged"):
             write(city, random_logits(rng), mask, np.eye(4), stamp=0.5)
@@ -73,7 +72,7 @@ import resource, sys
 import numpy as np
 from openvocab_occ.errors import StorageError
 from openvocab_occ.geometry import GridSpec
-from openvocab_occ.memory import TileMap
+from openvocab_occ.memory import TileMap, store
 city, spec = TileMap.open(sys.argv[1]), GridSpec((-4.0, -4.8, -1.0), 0.4, (20, 24, 8))
 logits = np.random.default_rng(1).normal(0, 2, (20, 24, 8, 4)).astype(np.float32)
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
@@ -117,3 +116,36 @@ def test_a_read_only_map_can_be_read_and_says_so(tmp_path, rng):
         for p, mode in zip(parents, modes, strict=True):
             p.chmod(mode & 0o7777)
     assert contents(city) == before
+
+
+def test_without_locks_a_lost_race_is_run_again(city, rng, monkeypatch):
+    """As in a bucket: somebody writes the same tiles between the read and the commit."""
+    monkeypatch.setattr(store, "fcntl", None)
+    other, mask = TileMap.open(city.store.name), np.ones(SPEC.shape, bool)
+    mine, theirs = random_logits(rng), random_logits(rng)
+    layer, real, calls = city.overlay("one"), city.overlay("one").fetch, []
+
+    def fetch(keys, known=None):
+        found = real(keys, known)
+        if not calls:
+            write(other, theirs, mask, np.eye(4), stamp=2.0)
+        calls.append(len(found))
+        return found
+
+    monkeypatch.setattr(layer, "fetch", fetch)
+    half = mask.copy()
+    half[SPEC.shape[0] // 2 :] = False
+    write(city, mine, half, np.eye(4), stamp=3.0)
+    assert calls == [2, 2], "both tiles were lost, and both were done again"
+    label = np.where(half, mine.argmax(-1), theirs.argmax(-1))
+    assert (city.read(np.eye(4), SPEC).logits.argmax(-1) == label).all()
+
+
+def test_what_others_wrote_is_not_taken_for_what_was_left_here(city, rng):
+    other, mask = TileMap.open(city.store.name), np.ones(SPEC.shape, bool)
+    for n, handle in enumerate((city, other, city, city, other)):
+        write(handle, random_logits(rng), rng.random(SPEC.shape) < 0.5, np.eye(4), stamp=float(n))
+    before = contents(city)
+    city.rebuild()
+    assert contents(city) == before
+    assert write(city, random_logits(rng), mask, np.eye(4), stamp=0.0).changed < mask.sum()
