@@ -11,11 +11,11 @@ from openvocab_occ.evaluation.grounding_queries import ABSENT, CATEGORIES, Quest
 from openvocab_occ.evaluation.grounding_truth import Truth, scene_of_truth, truth_of_city
 from openvocab_occ.objects import SceneMap, SceneObject
 from openvocab_occ.query.answer import Answer
-from openvocab_occ.query.find import find
+from openvocab_occ.query.find import LIKELY, find
 from openvocab_occ.segmentation.encoder import PixelEncoder
 
 IOUS = (0.1, 0.25, 0.5)
-_SAME = 0.25
+SAME = 0.25
 """IoU from which a hit is a true thing, for precision."""
 
 
@@ -37,7 +37,7 @@ class Outcome:
     @property
     def right(self) -> bool:
         """Tell whether the verdict is right, and where something is wanted the best hit too."""
-        return self.verdict == self.question.verdict and (not self.question.wanted or self.iou >= _SAME)
+        return self.verdict == self.question.verdict and (not self.question.wanted or self.iou >= SAME)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
@@ -111,10 +111,10 @@ def _outcome(answer: Answer, question: Question, of: Overlap) -> Outcome:
     for rank, hit in enumerate(hits):
         overlaps = {id: of(hit.object, id) for id in question.wanted - taken}
         best = max(overlaps, key=lambda id: overlaps[id], default=None)
-        right = best is not None and overlaps[best] >= _SAME
+        right = best is not None and overlaps[best] >= SAME
         if right and best is not None:
             taken.add(best)
-        elif any(of(hit.object, id) >= _SAME for id in question.either):
+        elif any(of(hit.object, id) >= SAME for id in question.either):
             continue
         counted.append(rank)
         correct.append(right)
@@ -131,7 +131,7 @@ def _outcome(answer: Answer, question: Question, of: Overlap) -> Outcome:
         verdict=answer.verdict,
         iou=iou,
         precision=precision,
-        count=len(counted),
+        count=max(sum(p is None or p >= LIKELY for p in (hits[rank].probability for rank in counted)), len(top)),
         confidence=tuple(confidence),
         correct=tuple(correct) if confidence else (),
     )

@@ -5,7 +5,7 @@ enough of is asked for, and what it saw less of may be named or not. A hit is ri
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -34,8 +34,10 @@ STUFF = ("sky", "road", "sidewalk", "grass")
 Occupancy = Literal["oracle", "perceived"] | Callable[[Frame], OccupancyGrid]
 _PERIOD = 0.5  # seconds between keyframes
 _CLASS_OF = {kind: name for name, kinds in CLASSES.items() if name not in STUFF for kind in kinds}
-ALSO = {"car": ("van",), "wall": ("building", "fence"), "building": ("wall",), "street lamp": ("traffic sign",)}
-"""Classes whose things may count as another: a person may call a van a car."""
+ALSO = {"car": ("van",), "wall": ("building", "fence", "shed"), "building": ("wall", "shed"),
+        "street lamp": ("traffic sign", "traffic signal")}  # fmt: skip
+"""Classes, and kinds of no class, whose things may count as another: a person may call a van a car, a shed a building.
+"""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -51,6 +53,8 @@ class Drive:
     """Things of which enough voxels were observed to be asked for."""
     watched: frozenset[int]
     """Things observed long enough for their state."""
+    others: Mapping[int, str] = field(default_factory=dict[int, str])
+    """Kinds of the things that no class names."""
 
     def overlap(self) -> Overlap:
         """Return the IoU of voxels, remembered by object."""
@@ -102,8 +106,8 @@ def drive_city(
     scene = builder.snapshot()
     sets = {id: keys for id, keys in record.sets(scene).items() if id in record.things}
     states, last = record.states(), {id: seen[-1][0] for id, seen in record.things.items()}
-    things = tuple(_true(way, id, states[id], last[id] - way.start_time()) for id in sets)
-    things = tuple(thing for thing in things if thing is not None)
+    found = [_true(way, id, states[id], last[id] - way.start_time()) for id in sets]
+    things = tuple(thing for thing in found if thing.kind in CLASSES)
     known = {thing.id for thing in things}
     viewer = viewpoint_of(scene, None)
     truth = Truth(name=f"city {seed}, route {route}, {condition}", things=things, viewer=viewer, ground=60.0)
@@ -114,6 +118,7 @@ def drive_city(
         sets=sets,
         sure=frozenset(id for id in known if len(sets[id]) >= MIN_VOXELS),
         watched=frozenset(long) & known,
+        others={thing.id: thing.kind for thing in found if thing.kind not in CLASSES},
     )
 
 
@@ -142,6 +147,7 @@ def questions_of(drive: Drive, seed: int, *, synonyms: Mapping[str, str] | None 
         names = {kind[id] for id in question.wanted}
         also = {other for name in names for other in ALSO.get(name, ())}
         doubt = {t.id for t in drive.truth.things if t.kind in also or (t.kind in names and t.id not in drive.sure)}
+        doubt |= {id for id, other in drive.others.items() if other in also}
         if question.category == "state":
             doubt |= {t.id for t in drive.truth.things if t.kind in names and t.id not in drive.watched}
         if wanted:
@@ -174,12 +180,10 @@ def _nouns(question: Question, things: Sequence[TrueThing]) -> set[str]:
     return {thing.kind for thing in things if thing.kind in question.text}
 
 
-def _true(way: Traversal, id: int, state: str, time: float) -> TrueThing | None:
-    """Return a thing where it is at a time; None for what no class names."""
+def _true(way: Traversal, id: int, state: str, time: float) -> TrueThing:
+    """Return a thing where it is at a time, called by its class, or by its own kind where no class names it."""
     things: dict[int, tuple[Thing, np.ndarray]] = {thing.id: (thing, thing.pose()) for thing in way.still}
     things |= {mover.thing.id: (mover.thing, way.mover_pose(mover, time)) for mover in way.movers}
     thing, pose = things[id]
-    name = _CLASS_OF.get(thing.kind)
-    return (
-        None if name is None else TrueThing(id=id, kind=name, color=thing.color, state=state, box=box_of(thing, pose))
-    )
+    name = _CLASS_OF.get(thing.kind, thing.kind)
+    return TrueThing(id=id, kind=name, color=thing.color, state=state, box=box_of(thing, pose))

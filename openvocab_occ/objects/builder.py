@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from openvocab_occ.mapping import VoxelMap
+from openvocab_occ.mapping.keys import unpack
 from openvocab_occ.objects.describe import describe, state_of
 from openvocab_occ.objects.frame_voxels import FrameVoxels
 from openvocab_occ.objects.refine import RefineConfig, Refinement, owners, refine
@@ -99,8 +100,13 @@ class ObjectBuilder:
         return [
             describe(track, packed, voxels, names=self.names, labels=self.labels, config=self.config.states)
             for track, packed in zip(refined, owners(refined), strict=True)
-            if len(packed)
+            if len(packed) and (track.moved or self._stands(packed, voxels))
         ]
+
+    def _stands(self, packed: Int64[np.ndarray, " n"], voxels: VoxelMap) -> bool:
+        """Tell whether the map still holds enough of a thing that did not move: the rest was seen through since."""
+        config = self.config.refine
+        return not config.drop or int((voxels.index(unpack(packed)) >= 0).sum()) >= config.min_voxels
 
     def tree(self, voxels: VoxelMap, ego: Sequence[np.ndarray] = ()) -> ObjectTree:
         """Return the tree of all frames so far; `ego` are the poses of the frames, which tell where the road leads."""

@@ -9,6 +9,8 @@ from jaxtyping import Float32, Float64, Int64
 from openvocab_occ.mapping import VoxelMap
 from openvocab_occ.mapping.keys import unpack
 from openvocab_occ.objects.box import Box, principal_yaw
+from openvocab_occ.objects.kinds import plausible_length
+from openvocab_occ.objects.looks import palette
 from openvocab_occ.objects.refine import class_of
 from openvocab_occ.objects.state import Motion, State, StateConfig, judge
 from openvocab_occ.objects.tracks import Track
@@ -47,7 +49,7 @@ def describe(
     if there.any() and state not in ("moving",):
         keys = keys[there]
     contract: Contract = voxels.contract
-    embedding = unit(track.feature_sum, contract)
+    embedding = unit(track.feature_sum if track.look is None else track.look.feature_sum, contract)
     name = class_of(track, names)
     if contract == "logits" and labels:
         best = int(embedding.argmax())
@@ -82,6 +84,7 @@ def describe(
         best_embedding=unit(np.sum([c.feature * c.score for c in crops], axis=0), contract) if crops else None,
         agreement=float(np.linalg.norm(track.feature_sum)) / max(track.weight, 1e-9) if contract == "dense" else 1.0,
         names=words,
+        colors=None if track.look is None else palette(track.look),
     )
 
 
@@ -100,7 +103,9 @@ def state_of(
     track: Track, voxels: VoxelMap, names: Sequence[str], config: StateConfig | None = None
 ) -> tuple[State, float, str]:
     """Return a track's state, how sure it is, and what speaks for it."""
-    return judge(motion_of(track, voxels, config), movable=track.movable(names), config=config)
+    lengths = plausible_length(class_of(track, names))
+    longest = None if lengths is None else lengths[1]
+    return judge(motion_of(track, voxels, config), movable=track.movable(names), longest=longest, config=config)
 
 
 def unpack_last(track: Track) -> Int64[np.ndarray, " n"]:

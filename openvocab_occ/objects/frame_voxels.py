@@ -1,7 +1,7 @@
 """What one frame says about voxels, after all its cameras are lifted: the ground segments are made on."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32, Int64, UInt8
@@ -10,9 +10,22 @@ from openvocab_occ.datasets.frame import Frame
 from openvocab_occ.mapping import NO_LABEL, Cover, Lifted, cover_grid
 from openvocab_occ.mapping.keys import pack
 from openvocab_occ.occupancy import OccupancyGrid
-from openvocab_occ.segmentation.encoder import Contract
+from openvocab_occ.segmentation.encoder import Contract, FeatureMap
 
 _PIXELS = 60_000  # of a view, enough to tell where in it a segment lies
+
+
+@dataclass(frozen=True, eq=False)
+class PixelSight:
+    """What the pixels of a view show, as thinned as its `PixelRows`."""
+
+    image: UInt8[np.ndarray, "h w 3"]
+    depth: Float32[np.ndarray, "h w"]
+    """z-depth, metres."""
+    focal: float
+    """Of the whole image, pixels."""
+    features: FeatureMap
+    """Of the whole image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +37,8 @@ class PixelRows:
     """Position in `FrameVoxels`; -1 for none."""
     stride: int
     """Every how many pixels along both axes."""
+    sight: "PixelSight | None" = None
+    """None where the model puts out masks."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -62,6 +77,7 @@ def gather(
     voxel_size: float,
     contract: Contract,
     grid: OccupancyGrid | None = None,
+    sights: Sequence[tuple[Float32[np.ndarray, "h w"], FeatureMap | None]] = (),
 ) -> FrameVoxels:
     """Put the views of a frame together: rows of different cameras that share a voxel become one.
 
@@ -75,6 +91,7 @@ def gather(
         contract: Of the encoder.
         grid: The frame's grid. Its occupied voxels that no camera sees are kept as hidden ones where it names classes;
             they tell that a car behind a pole is one thing, and where the far side of a truck is.
+        sights: Depth and features of each view; no features of a model that puts out masks.
     """
     share = lifted.weight[cover.row] * cover.share
     used = share > 0
@@ -113,20 +130,31 @@ def gather(
         weight=np.bincount(inverse, share, minlength=len(packed)).astype(np.float32),
         labels=everywhere,
         window=grid,
-        views=tuple(_pixel_rows(views, at)),
+        views=tuple(_pixel_rows(views, at, frame, sights)),
         masks=masks,
     )
 
 
 def _pixel_rows(
-    views: Sequence[tuple[str, Int32[np.ndarray, "h w"], int]], at: Int32[np.ndarray, " m"]
+    views: Sequence[tuple[str, Int32[np.ndarray, "h w"], int]],
+    at: Int32[np.ndarray, " m"],
+    frame: Frame,
+    sights: Sequence[tuple[Float32[np.ndarray, "h w"], FeatureMap | None]],
 ) -> Iterator[PixelRows]:
     """Yield which voxel every so many pixels of each view are about."""
     first = 0
-    for name, rows, count in views:
+    for n, (name, rows, count) in enumerate(views):
         stride = max(1, round((rows.size / _PIXELS) ** 0.5))
         thin = rows[::stride, ::stride]
-        yield PixelRows(name, at[np.where(thin >= 0, thin + first, len(at) - 1)], stride)
+        found = PixelRows(name, at[np.where(thin >= 0, thin + first, len(at) - 1)], stride)
+        if sights:
+            view, (depth, features) = frame.views[n], sights[n]
+            if features is not None:
+                thin = (slice(None, None, stride), slice(None, None, stride))
+                found = replace(
+                    found, sight=PixelSight(view.image[thin], depth[thin], float(view.camera.K[0, 0]), features)
+                )
+        yield found
         first += count
 
 

@@ -27,6 +27,7 @@ _OBJECTS = pa.schema([
     ("times_seen", pa.int64()), ("first_seen", pa.float64()), ("last_seen", pa.float64()), ("agreement", pa.float64()),
     ("names", pa.list_(pa.struct([("name", pa.string()), ("score", pa.float64())]))),
     ("best_embedding", pa.list_(pa.float32())), ("moved_points", pa.list_(pa.float32())),
+    ("colors", pa.list_(pa.float32())),
 ])  # fmt: skip
 _EVIDENCE = ("evidence", "confidence", "heading", "speed", "times_seen", "first_seen", "last_seen", "agreement")
 _CAMERA = pa.struct([
@@ -120,7 +121,7 @@ def _object_row(node: SceneObject) -> dict[str, Any]:
     moved = node.points.ravel() if len(node.points) != len(node.voxels) else None  # not those of its voxels
     return same | box | more | {
         "embedding": node.embedding, "voxels": node.voxels, "views": views, "names": names, "best_embedding": best,
-        "moved_points": moved,
+        "moved_points": moved, "colors": None if node.colors is None else node.colors.ravel(),
     }  # fmt: skip
 
 
@@ -129,7 +130,7 @@ def _object(row: Mapping[str, Any], positions: np.ndarray, voxels: VoxelMap) -> 
     if embedding.shape != (voxels.dim,) or not np.isfinite(embedding).all():
         raise MapError(f"embedding of object {row['id']} is not usable", expected=f"{voxels.dim} finite numbers")
     same = {name: row[name] for name in ("id", "level", "parent", "label", "score", "state", *_EVIDENCE)}
-    best, moved = row["best_embedding"], row["moved_points"]
+    best, moved, colors = row["best_embedding"], row["moved_points"], row.get("colors")
     points = voxels.centers_at(positions) if moved is None else np.reshape(moved, (-1, 3))
     return SceneObject(
         **same,
@@ -141,6 +142,7 @@ def _object(row: Mapping[str, Any], positions: np.ndarray, voxels: VoxelMap) -> 
         views=tuple(Sighting(**(view | {"box": tuple(view["box"])})) for view in row["views"]),
         names=tuple((name["name"], name["score"]) for name in row["names"]),
         best_embedding=None if best is None else np.asarray(best, dtype=np.float32),
+        colors=None if colors is None else np.reshape(np.asarray(colors, dtype=np.float32), (-1, 4)),
     )
 
 

@@ -6,7 +6,7 @@ border of two cameras is one segment.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
@@ -19,6 +19,7 @@ from openvocab_occ.mapping.keys import pack, unpack
 from openvocab_occ.objects import _segments_kernels as kernels
 from openvocab_occ.objects.frame_voxels import FrameVoxels, PixelRows
 from openvocab_occ.objects.kinds import Kind, kinds_of
+from openvocab_occ.objects.looks import Look, looks_of
 from openvocab_occ.occupancy import OccupancyGrid
 
 _FORWARD = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)])[14:]
@@ -100,6 +101,8 @@ class Segment:
     cut_off: bool
     """True where the grid ends at it: its far side is not known."""
     crops: tuple[Crop, ...] = field(default=(), repr=False)
+    look: Look | None = field(default=None, repr=False)
+    """What its own pixels show; None where no cell tells."""
 
     @property
     def center(self) -> Float64[np.ndarray, " 3"]:
@@ -131,8 +134,12 @@ def segment_frame(frame: FrameVoxels, names: Sequence[str] = (), config: Segment
     groups = [g for g in groups if (row[g] >= 0).sum() >= config.min_voxels]
     groups.sort(key=lambda g: (-len(g), packed[g[0]]))
     crops = _crops(frame, [row[g][row[g] >= 0] for g in groups])
+    looks = looks_of(frame, [row[g][row[g] >= 0] for g in groups])
     size = max(len(names), 1)
-    segments = [_segment(frame, packed[g], row[g], classes[g], crops[number], size) for number, g in enumerate(groups)]
+    segments = [
+        replace(_segment(frame, packed[g], row[g], classes[g], crops[n], size), look=looks[n])
+        for n, g in enumerate(groups)
+    ]
     return [s for s in segments if names or not _is_ground(s, frame, config)]
 
 

@@ -119,10 +119,17 @@ def observe_motion(
     )
 
 
-def judge(motion: Motion, *, movable: float, config: StateConfig | None = None) -> tuple[State, float, str]:
+def judge(
+    motion: Motion, *, movable: float, longest: float | None = None, config: StateConfig | None = None
+) -> tuple[State, float, str]:
     """Return the state, how sure it is (0 to 1, not a probability), and what speaks for it.
 
-    `movable` is the share of the class evidence that speaks for a thing that can move: NaN where there is none.
+    Args:
+        motion: What was seen of it.
+        movable: The share of the class evidence that speaks for a thing that can move: NaN where there is none.
+        longest: Metres, of the longest thing of its kind: seen in pieces, none seems to move further than that. None
+            where its kind tells no length.
+        config: When a thing counts as moved, and as parked.
     """
     config = config or StateConfig()
     seen = f"{motion.sightings} sightings in {motion.time_observed:.1f} s"
@@ -132,7 +139,8 @@ def judge(motion: Motion, *, movable: float, config: StateConfig | None = None) 
     span = f"moved {motion.extent:.1f} +- {motion.sigma:.1f} m"
     far = motion.extent >= config.extent
     clear = motion.extent >= max(config.clear_extent, 3 * motion.sigma) and motion.mean_speed >= config.speed
-    gone = motion.left >= config.left or motion.extent >= config.surely
+    surely = config.surely if longest is None else min(config.surely, longest + 3 * motion.sigma)
+    gone = motion.left >= config.left or motion.extent >= surely
     if (far or clear) and gone and not fixed:
         sure = 1 - float(np.exp(-motion.extent / max(3 * motion.sigma, 1e-9)))
         state = "moving" if motion.speed >= config.speed else "stopped"

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 
 from openvocab_occ.mapping.keys import pack, unpack
 from openvocab_occ.objects.kinds import Kind, kinds_of
+from openvocab_occ.objects.looks import Look, added
 from openvocab_occ.objects.segments import Crop, Segment
 from openvocab_occ.objects.state import Motion, StateConfig, observe_motion, shift
 
@@ -28,6 +29,8 @@ class Track:
     feature_sum: Float32[np.ndarray, " c"]
     class_votes: Float32[np.ndarray, " k"]
     weight: float = 0.0
+    look: Look | None = None
+    """What its own pixels show."""
     agreement_sum: float = 0.0
     """Frame features' lengths along the mean, by weight: how far the frames agree."""
     frames: list[int] = field(default_factory=list[int])
@@ -84,6 +87,7 @@ class Track:
         self.feature_sum = self.feature_sum + other.feature_sum
         self.class_votes = self.class_votes + other.class_votes
         self.weight += other.weight
+        self.look = added(self.look, other.look)
         self.agreement_sum += other.agreement_sum
         if min(other.times) < min(self.times):
             self.first = other.first
@@ -176,6 +180,7 @@ class Track:
         self.feature_sum = self.feature_sum + segment.feature_sum
         self.class_votes = self.class_votes + segment.class_votes
         self.weight += segment.weight
+        self.look = added(self.look, segment.look)
         self._keep_crops(segment.crops)
 
     def _measure(self, segment: Segment, time: float) -> None:
@@ -227,6 +232,7 @@ def joined(a: Segment, b: Segment) -> Segment:
         high=np.maximum(a.high, b.high),
         cut_off=a.cut_off or b.cut_off,
         crops=a.crops + b.crops,
+        look=added(a.look, b.look),
     )
 
 

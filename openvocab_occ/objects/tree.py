@@ -72,6 +72,9 @@ class SceneObject:
     """How far its sightings agree: length of their mean feature, 1 when all are the same."""
     names: tuple[tuple[str, float], ...] = ()
     """Best words of a vocabulary and their scores, best first."""
+    colors: Float32[np.ndarray, "k 4"] | None = field(default=None, repr=False)
+    """Colours that its own pixels show, the commonest first: share of the pixels, and mean sRGB from 0 to 255; None
+    where no image told."""
 
     @property
     def time_observed(self) -> float:

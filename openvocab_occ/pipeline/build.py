@@ -195,7 +195,9 @@ class MapBuilder:
             )
         views = [(view.name, one.rows, len(one.labels)) for view, one in zip(frame.views, seen, strict=True)]
         self._objects.observe(gather(views, cover, labels, lifted, frame=frame, voxel_size=voxel_size,
-                                     contract=self._encoder.contract, grid=grid))  # fmt: skip
+                                     contract=self._encoder.contract, grid=grid,
+                                     sights=[(one.depth, f if isinstance(f, FeatureMap) else None)
+                                             for one, f in zip(seen, cells, strict=True)]))  # fmt: skip
         cameras = tuple(NamedCamera.of(view.camera, view.name) for view in frame.views)
         self._frames.append(KeyFrame(frame.index, frame.timestamp, frame.T_world_ego, cameras))
 

@@ -30,6 +30,7 @@ class Counted(NamedTuple):
     """How many things fit."""
 
     value: int
+    """Things that fit; where scores are calibrated those more likely than not, and one where anything is found."""
     low: int
     """How many fit with degree 3/4 or more."""
     high: int

@@ -1,24 +1,30 @@
 """Colours by name, in Oklab, where equal distances look equally far (Ottosson 2020)."""
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float, Float32, Float64, Int64, UInt8
 
 NAMES = ("red", "orange", "yellow", "green", "blue", "purple", "pink", "brown", "white", "grey", "black")
-CHROMATIC = np.array([name not in ("white", "grey", "black") for name in NAMES])
-_EXAMPLES = {
-    "red": [(200, 30, 35), (120, 20, 25), (225, 75, 65)],
-    "orange": [(235, 120, 30), (200, 95, 25)],
-    "yellow": [(240, 210, 50), (200, 170, 40)],
-    "green": [(40, 140, 50), (25, 75, 40), (120, 170, 70), (90, 110, 50)],
-    "blue": [(30, 70, 185), (70, 145, 220), (20, 35, 95)],
-    "purple": [(110, 50, 150), (70, 30, 95)],
-    "pink": [(240, 140, 175), (220, 80, 140)],
-    "brown": [(110, 70, 40), (155, 105, 65), (70, 42, 25)],
-}
-_GREY_BELOW = 0.055
-"""Chroma over lightness, below which a colour has no hue: a hue stays as a surface falls into shade, chroma fades."""
-_BLACK_BELOW, _WHITE_ABOVE = 0.33, 0.86  # lightness
-_LIGHTNESS_WEIGHT = 0.4  # light says less about a surface than hue does
+GREY = np.array([name in ("white", "grey", "black") for name in NAMES])
+_HUES = ((-30.0, "pink"), (15.0, "red"), (34.0, "orange"), (72.0, "yellow"), (112.0, "green"), (205.0, "blue"),
+         (285.0, "purple"), (330.0, "pink"))  # fmt: skip
+"""Angle in degrees from which a hue is called so. Dark pink is red, and pale orange brown."""
+_GREY_BELOW = 0.125
+"""Chroma over lightness, below which a colour has no hue: it and the hue stay as a surface falls into shade. Glass in
+which the sky shows has about as much."""
+_LEAST_CHROMA = 0.04
+"""Below this the noise of a dark picture has a hue too."""
+_BROWN_BELOW = 0.2
+"""The same, below which orange is brown."""
+_PINK_ABOVE = 0.6  # lightness
+_NO_HUE = 0.2  # lightness below which a picture tells no hue
+_BLACK_BELOW, _WHITE_ABOVE = 0.43, 0.77
+"""Lightness in a picture of which the middle is `MIDDLE`."""
+MIDDLE = 0.62
+_SOFT = 0.08  # of lightness, over which grey becomes black or white
+_PAINTED = 0.25
+"""Share of a thing's pixels from which a hue is its colour: tyres, glass and shade make part of each thing dark."""
+_LIGHTEST = 0.65
+"""What is lighter than this share of a thing's pixels is its paint where nothing has a hue, for the same reason."""
 
 
 def oklab(rgb: UInt8[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
@@ -35,27 +41,50 @@ def oklab(rgb: UInt8[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
 def names_of(rgb: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
     """Return the position in NAMES of each colour."""
     lab = oklab(rgb)
-    scale = np.array([_LIGHTNESS_WEIGHT, 1, 1], dtype=np.float32)
-    examples, owner = _examples()
-    distance = ((lab * scale)[:, None] - (examples * scale)[None]) ** 2  # n k 3
-    name = owner[distance.sum(axis=2).argmin(axis=1)]
-    chroma = np.hypot(lab[:, 1], lab[:, 2])
-    grey = chroma < _GREY_BELOW * (lab[:, 0] + 0.1)
-    dark, light = lab[:, 0] < _BLACK_BELOW, lab[:, 0] > _WHITE_ABOVE
-    shade = np.where(dark, NAMES.index("black"), np.where(light, NAMES.index("white"), NAMES.index("grey")))
-    return np.where(grey | (lab[:, 0] < 0.16), shade, name).astype(np.uint8)
+    light = lab[:, 0]
+    hue = _hues(lab)
+    shade = np.where(light < _BLACK_BELOW, NAMES.index("black"), NAMES.index("grey"))
+    shade = np.where(light > _WHITE_ABOVE, NAMES.index("white"), shade)
+    return np.where(hue < 0, shade, hue).astype(np.uint8)
 
 
-def degrees(names: UInt8[np.ndarray, " n"]) -> Float64[np.ndarray, " k"]:
-    """Return how far a thing is of each colour in NAMES, by those of its voxels: the commonest has 1.
+def degrees(colors: Float[np.ndarray, "k 4"], middle: float = MIDDLE) -> Float64[np.ndarray, " names"]:
+    """Return how far a thing is of each colour in NAMES.
 
-    Hues count double: windows, tyres and shade make part of every vehicle black or grey.
+    A hue is the thing's colour when enough of its pixels have it and no other hue has twice as many. Where none has
+    enough, the thing is grey, black or white by the lightest of what it shows, held against the whole picture's light.
+
+    Args:
+        colors: Share of its pixels, and sRGB from 0 to 255.
+        middle: Lightness of the middle of the picture, or map.
     """
-    counts = np.bincount(names, minlength=len(NAMES))[: len(NAMES)] * np.where(CHROMATIC, 2.0, 1.0)
-    return counts / max(float(counts.max()), 1e-12)
+    share = colors[:, 0].astype(np.float64) / max(float(colors[:, 0].sum()), 1e-12)
+    lab = oklab(np.clip(np.rint(colors[:, 1:]), 0, 255).astype(np.uint8))
+    hue = _hues(lab)
+    held = np.bincount(hue[hue >= 0], share[hue >= 0], minlength=len(NAMES))
+    most = float(held.max())
+    found = held / max(most, _PAINTED)
+    plain = np.flatnonzero(hue < 0)
+    if not len(plain):
+        return found
+    order = plain[np.argsort(lab[plain, 0], kind="stable")]
+    reached = np.cumsum(share[order]) >= _LIGHTEST * share[plain].sum() - 1e-12
+    light = float(lab[order[int(reached.argmax())], 0]) * MIDDLE / max(middle, 0.1)
+    black = float(np.clip(0.5 + (_BLACK_BELOW - light) / _SOFT, 0, 1))
+    white = float(np.clip(0.5 + (light - _WHITE_ABOVE) / _SOFT, 0, 1))
+    left = max(1 - most / _PAINTED, 0.0)
+    for name, degree in (("black", black), ("white", white), ("grey", 1 - max(black, white))):
+        found[NAMES.index(name)] = degree * left
+    return found
 
 
-def _examples() -> tuple[Float32[np.ndarray, "k 3"], np.ndarray]:
-    rgb = np.array([c for name in _EXAMPLES for c in _EXAMPLES[name]], dtype=np.uint8)
-    owner = np.array([NAMES.index(name) for name in _EXAMPLES for _ in _EXAMPLES[name]])
-    return oklab(rgb), owner
+def _hues(lab: Float32[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
+    """Return the position in NAMES of each colour's hue; -1 for none."""
+    light, chroma = lab[:, 0], np.hypot(lab[:, 1], lab[:, 2])
+    angle = (np.degrees(np.arctan2(lab[:, 2], lab[:, 1])) - _HUES[0][0]) % 360 + _HUES[0][0]
+    numbers = np.array([NAMES.index(name) for _, name in _HUES])
+    hue = numbers[np.searchsorted([start for start, _ in _HUES], angle, side="right") - 1]
+    ratio = chroma / np.maximum(light, 1e-6)
+    hue = np.where((hue == NAMES.index("pink")) & (light < _PINK_ABOVE), NAMES.index("red"), hue)
+    hue = np.where((hue == NAMES.index("orange")) & (ratio < _BROWN_BELOW), NAMES.index("brown"), hue)
+    return np.where((ratio < _GREY_BELOW) | (chroma < _LEAST_CHROMA) | (light < _NO_HUE), -1, hue)

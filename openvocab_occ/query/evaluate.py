@@ -225,7 +225,8 @@ class Evaluator:
         if self._depth == 0:
             self._main.append(reading)
             self.report.calibrated &= reading.kind == "probability"
-        score = reading.score(self.index.embeddings).astype(np.float64)
+        said = self.index.said(reading.worth(self.index.label_names)) if reading.classes else None
+        score = reading.score(self.index.embeddings, said).astype(np.float64)
         degree = reading.degree(score)
         return self._masked(Clause(degree, degree, score))
 

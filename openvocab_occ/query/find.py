@@ -22,12 +22,14 @@ from openvocab_occ.query.llm import LanguageModel
 from openvocab_occ.query.reading import reading_of
 from openvocab_occ.query.region import share_seen
 from openvocab_occ.query.relations import Viewpoint
-from openvocab_occ.query.scoring import Scorer
+from openvocab_occ.query.scoring import Reading, Scorer
 from openvocab_occ.segmentation.encoder import PixelEncoder
 
 Seen = Viewpoint | Float[np.ndarray, "4 4"] | float | None
 """A viewpoint, the pose T_world_ego of a viewer, a time (ego at the frame nearest to it); None: ego at the end."""
 _SEEN_ENOUGH = 0.5
+LIKELY = 0.5
+"""Probability from which a thing is counted: a hit may be less likely than that where the card's threshold is lower."""
 
 
 def find(
@@ -180,12 +182,14 @@ def _hits(evaluator: Evaluator, clause: Clause | None, limit: int | None, *, cal
 def _counted(clause: Clause | None, *, calibrated: bool) -> Counted:
     if clause is None:
         return NONE_COUNTED
-    value, low, high = (
+    fits, low, high = (
         int(n) for n in ((clause.low >= HALF).sum(), (clause.low >= 0.75).sum(), (clause.high >= 0.25).sum())
     )
+    if not calibrated:
+        return Counted(fits, low, high, None, None)
     p = np.clip(clause.score, 0.0, 1.0)
-    spread = (float(p.sum()), float(np.sqrt((p * (1 - p)).sum()))) if calibrated else (None, None)
-    return Counted(value, low, high, *spread)
+    value = max(int(((clause.low >= HALF) & (p >= LIKELY)).sum()), min(fits, 1))
+    return Counted(value, min(low, value), max(high, value), float(p.sum()), float(np.sqrt((p * (1 - p)).sum())))
 
 
 def _all_calibrated(query: Node | None) -> bool:
@@ -211,7 +215,7 @@ class _Voxels:
         match query:
             case q.Noun(text):
                 reading = self.evaluator.scorer.noun(text).reading
-                return np.zeros(n, np.float32) if reading is None else reading.score(self.scene.voxels.features)
+                return np.zeros(n, np.float32) if reading is None else self._noun(reading)
             case q.And(of):
                 return np.multiply.reduce([self.score(part) for part in of]).astype(np.float32)
             case q.Or(of):
@@ -222,12 +226,18 @@ class _Voxels:
                 reading = self.evaluator.scorer.noun(text).reading
                 if reading is None:
                     return np.ones(n, np.float32)
-                return (1 - reading.degree(reading.score(self.scene.voxels.features))).astype(np.float32)
+                return (1 - reading.degree(self._noun(reading))).astype(np.float32)
             case q.Color(name) if name not in ("bright", "dark"):
                 from openvocab_occ.query.colors import NAMES
 
                 return (self.evaluator.index.voxel_color_names == NAMES.index(name)).astype(np.float32)
         return self._of_objects(self.evaluator.evaluate(query))
+
+    def _noun(self, reading: Reading) -> Float32[np.ndarray, " n"]:
+        voxels, names = self.scene.voxels, self.scene.class_names
+        worth = np.zeros(256)
+        worth[: len(names)] = reading.worth(names)
+        return reading.score(voxels.features, worth[voxels.labels] if reading.classes else None)
 
     def _of_objects(self, clause: Clause | None) -> Float32[np.ndarray, " n"]:
         scores = np.zeros(len(self.scene.voxels), dtype=np.float32)

@@ -29,6 +29,8 @@ class Index:
         self.boxes = Boxes.of(self.nodes)
         self.level_names, self.levels = _coded([node.level for node in self.nodes])
         self.state_names, self.states = _coded([node.state for node in self.nodes])
+        self.label_names, self._labels = _coded([node.label for node in self.nodes])
+        self._purity = np.array([node.score for node in self.nodes], dtype=np.float64)
         self._voxels = scene.voxels
         self._voxel_size = scene.voxels.voxel_size
         self._dim = scene.voxels.dim
@@ -42,6 +44,10 @@ class Index:
         """One row a node."""
         rows = [node.embedding for node in self.nodes]
         return np.stack(rows).astype(np.float32, copy=False) if rows else np.zeros((0, self._dim), np.float32)
+
+    def said(self, worth: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, " n"]:
+        """Return what the labels of nodes are worth, given that of each name, by the share of what speaks for them."""
+        return worth[self._labels] * self._purity
 
     @cached_property
     def regions_of_things(self) -> Bool[np.ndarray, " n"]:
@@ -70,17 +76,32 @@ class Index:
         """Return how far nodes are of a colour, and whether any colour of them was observed."""
         degree, known = np.zeros(len(rows)), np.zeros(len(rows), dtype=bool)
         for i, row in enumerate(rows):
-            voxels = self.nodes[row].voxels
-            seen = voxels[self.voxel_color_names[voxels] != 255]
-            known[i] = len(seen) > 0
+            shown = self._shown(int(row))
+            known[i] = len(shown) > 0
             if not known[i]:
                 continue
             if name in ("bright", "dark"):
-                light = float(np.median(colors.oklab(self._colors[seen])[:, 0]))
+                lightness = colors.oklab(np.clip(np.rint(shown[:, 1:]), 0, 255).astype(np.uint8))[:, 0]
+                light = _middle(lightness, shown[:, 0])
                 degree[i] = np.clip((light - 0.5) / 0.4 if name == "bright" else (0.7 - light) / 0.4, 0.0, 1.0)
             else:
-                degree[i] = colors.degrees(self.voxel_color_names[seen])[colors.NAMES.index(name)]
+                degree[i] = colors.degrees(shown, self._middle_light)[colors.NAMES.index(name)]
         return degree, known
+
+    def _shown(self, row: int) -> Float32[np.ndarray, "k 4"]:
+        """Return the colours of a node: those its own pixels showed, else those of its voxels."""
+        node = self.nodes[row]
+        if node.colors is not None:
+            return node.colors
+        rgb = self._colors[node.voxels]
+        rgb = rgb[rgb.any(axis=1)]  # black is where no image gave a colour
+        return np.concatenate([np.full((len(rgb), 1), 1 / max(len(rgb), 1)), rgb], axis=1).astype(np.float32)
+
+    @cached_property
+    def _middle_light(self) -> float:
+        """Median lightness of the map's voxels."""
+        rgb = self._colors[self._colors.any(axis=1)]
+        return float(np.median(colors.oklab(rgb[:: len(rgb) // _AT_ONCE + 1])[:, 0])) if len(rgb) else colors.MIDDLE
 
     def on_levels(self, names: Iterable[str]) -> Bool[np.ndarray, " n"]:
         """Tell which nodes are of some levels."""
@@ -101,6 +122,13 @@ class Index:
                 columns = None
             self._anchors[row] = Anchor(box, columns)
         return self._anchors[row]
+
+
+def _middle(values: Float32[np.ndarray, " k"], weights: Float32[np.ndarray, " k"]) -> float:
+    """Return the weighted median."""
+    order = np.argsort(values, kind="stable")
+    total = np.cumsum(weights[order])
+    return float(values[order[int(np.searchsorted(total, total[-1] / 2))]])
 
 
 def _coded(values: list[str]) -> tuple[list[str], Int64[np.ndarray, " n"]]:

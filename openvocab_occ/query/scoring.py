@@ -2,8 +2,10 @@
 
 import math
 import struct
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
@@ -22,6 +24,7 @@ DENSE_THRESHOLD = DEFAULT_THRESHOLD["cosine"]
 LIKE_THRESHOLD = 0.8
 """Cosine of two things that look alike: image features lie closer to each other than to words."""
 _MAX_PIXELS = 1 << 25
+_NAMED: "WeakKeyDictionary[SceneMap, dict[str, np.ndarray]]" = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -35,9 +38,15 @@ class Reading:
     bias: float = 0.0
     negatives: Float32[np.ndarray, "k c"] | None = None
     """Unit vectors that the text must win against."""
+    classes: Mapping[str, float] = field(default_factory=dict[str, float])
+    """What a name of an occupancy class adds before the sigmoid; others add nothing."""
 
-    def score(self, features: Float32[np.ndarray, "n c"]) -> Float32[np.ndarray, " n"]:
+    def score(
+        self, features: Float32[np.ndarray, "n c"], said: Float[np.ndarray, " n"] | None = None
+    ) -> Float32[np.ndarray, " n"]:
         """Return the score of features that are unit vectors, zero, or distributions.
+
+        `said` is what is added for the classes that occupancy names; see `worth`.
 
         One product of matrix and vector; with negatives one product of matrices, so that features are read once.
         """
@@ -46,7 +55,14 @@ class Reading:
             cosine, rival = both[:, 0], both[:, 1:].max(axis=1)
             return _sigmoid(self.scale * (cosine - rival))  # a softmax of two
         cosine = features @ self.vector
-        return cosine if self.kind in ("cosine", "class probability") else _sigmoid(self.scale * cosine + self.bias)
+        if self.kind in ("cosine", "class probability"):
+            return cosine
+        logits = self.scale * cosine + self.bias
+        return _sigmoid(logits if said is None else logits + said)
+
+    def worth(self, names: Sequence[str]) -> Float64[np.ndarray, " k"]:
+        """Return what each name of a class adds."""
+        return np.array([self.classes.get(name, 0.0) for name in names], dtype=np.float64)
 
     def degree(self, score: Float[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
         """Return scores as degrees: 0 at 0, 1/2 at the threshold, 1 at 1, straight lines between."""
@@ -81,6 +97,8 @@ class Scorer:
         self.info, self.encoder, self.asked = scene.encoder, encoder, threshold
         self.card: Any = getattr(encoder, "scoring", None)  # optional in the protocol
         self.has_labels = scene.encoder.contract == "logits"
+        self._scene = scene
+        self._class_names = () if self.has_labels else scene.class_names
 
     @property
     def kind(self) -> ScoreKind:
@@ -128,7 +146,10 @@ class Scorer:
         if self.card is None:
             return Reading(vector=unit, kind="cosine", threshold=self.threshold)
         names = ("kind", "scale", "bias", "negatives")
-        return Reading(vector=unit, threshold=self.threshold, **{name: getattr(self.card, name) for name in names})
+        return Reading(
+            vector=unit, threshold=self.threshold, classes=self._classes(unit),
+            **{name: getattr(self.card, name) for name in names},
+        )  # fmt: skip
 
     def like(self, vector: Float32[np.ndarray, " c"]) -> Reading:
         """Read the vector of something seen: its cosine with what else was seen."""
@@ -141,6 +162,25 @@ class Scorer:
             raise ConfigError("a picture needs the map's encoder", got="no encoder", fix="find(scene, query, encoder)")
         cells = self.encoder.encode([_decoded(image)])[0].cells
         return self.like(cells.reshape(-1, cells.shape[-1]).mean(axis=0).astype(np.float32))
+
+    def _classes(self, vector: Float32[np.ndarray, " c"]) -> dict[str, float]:
+        """Return what each class name of the map's occupancy is worth for a text; none that the model does not know."""
+        if not self.card.classes:
+            return {}
+        near = self.nearness(vector, self.card.neutral)
+        return {name: self.card.classes * above for name, above in near.items()}
+
+    def nearness(self, vector: Float32[np.ndarray, " c"], neutral: float) -> dict[str, float]:
+        """Return by how much each class name of the map's occupancy is nearer to a text than `neutral`; only those."""
+        near = {name: float(own @ vector) - neutral for name, own in self._named().items()}
+        return {name: above for name, above in near.items() if above > 0}
+
+    def _named(self) -> dict[str, Float32[np.ndarray, " c"]]:
+        """Return the vector of each class name that the text model knows, encoded once a map."""
+        if self._scene not in _NAMED:
+            known = [name for name in self._class_names if not self._unknown(name)]
+            _NAMED[self._scene] = {name: self._unit(self._encode(name)) for name in known}
+        return _NAMED[self._scene]
 
     def _unit(self, vector: Float32[np.ndarray, " c"]) -> Float32[np.ndarray, " c"]:
         vector = np.asarray(vector, dtype=np.float32)

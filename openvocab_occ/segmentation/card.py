@@ -166,14 +166,18 @@ class PromptCard(_Strict, frozen=True, kw_only=True):
 
 
 class Calibration(_Strict, frozen=True, kw_only=True):
-    """Platt scaling: probability = sigmoid(a cosine + b), fitted on labelled voxels."""
+    """Platt scaling: probability = sigmoid(a cosine + b), fitted on labelled voxels or objects."""
 
     a: float
     b: float
     dataset: str
     date: str
     count: Annotated[int, msgspec.Meta(ge=0)]
-    """Labelled voxels it was fitted on."""
+    """Labelled voxels it was fitted on, or pairs of an object and a word."""
+    classes: float = 0.0
+    """What the class that occupancy names is worth: where its name is nearer to the text than `neutral`, classes x
+    (their cosine - neutral) is added before the sigmoid. Other names say nothing: such classes are coarse."""
+    neutral: float = 0.0
 
 
 class ScoreCard(_Strict, frozen=True, kw_only=True):

@@ -30,6 +30,9 @@ class Scoring:
     bias: float = 0.0
     negatives: Float32[np.ndarray, "k c"] | None = None
     """Unit vectors that a text must win against; relevancy only."""
+    classes: float = 0.0
+    """What the name of an occupancy class is worth; see `card.Calibration`."""
+    neutral: float = 0.0
 
     def __call__(
         self, features: Float[np.ndarray, "n c"], vector: Float[np.ndarray, " c"]
@@ -53,7 +56,10 @@ def scoring_of(card: ScoreCard, text: TextEncoder) -> Scoring:
     kind: Kind = "probability" if card.calibration is not None else card.kind
     threshold = card.threshold if card.threshold is not None else DEFAULT_THRESHOLD[kind]
     if card.calibration is not None:
-        return Scoring(kind=kind, threshold=threshold, scale=card.calibration.a, bias=card.calibration.b)
+        fit = card.calibration
+        return Scoring(
+            kind=kind, threshold=threshold, scale=fit.a, bias=fit.b, classes=fit.classes, neutral=fit.neutral
+        )
     negatives = np.asarray(text.encode(card.negatives), dtype=np.float32) if card.negatives else None
     return Scoring(kind=kind, threshold=threshold, scale=card.scale or 1.0, bias=card.bias, negatives=negatives)
 

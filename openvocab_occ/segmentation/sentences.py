@@ -71,7 +71,8 @@ def _score(card: Card | FilesCard) -> str:
     score = card.score
     if score.calibration is not None:
         fit = score.calibration
-        formula = f"probability, sigmoid({fit.a:.2f} cosine {fit.b:+.2f})"
+        named = f" + {fit.classes:.2f} (cosine of class and text - {fit.neutral:.2f})" if fit.classes else ""
+        formula = f"probability, sigmoid({fit.a:.2f} cosine {fit.b:+.2f}{named})"
         return f"{formula}, fitted on {fit.count:,} of {fit.dataset}, {fit.date}"
     said = {
         "cosine": "cosine",

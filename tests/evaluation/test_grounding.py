@@ -159,6 +159,14 @@ def test_a_drive_that_saw_the_truth_answers_everything(truth):
     assert {"class", "synonym", "state", "relation", "absent", "unobserved"} <= set(scores)
 
 
+def test_what_no_class_names_may_be_called_what_it_resembles(truth):
+    drive = driven(truth, scene_of_truth(truth, also=(*ABSENT, *CLASSES)))
+    near = replace(drive, others={99: "van", 98: "bench"})
+    cars = {q.text: q for q in questions_of(near, 0)}["cars"]
+    assert 99 in cars.either
+    assert 98 not in cars.either | cars.wanted
+
+
 def test_a_drive_of_something_else_does_not(truth):
     """Objects that are not where the true things are."""
     drive = driven(truth, scene_of_truth(truth, also=(*ABSENT, *CLASSES)))

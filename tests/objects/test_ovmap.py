@@ -1,6 +1,6 @@
 import json
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pyarrow as pa
@@ -10,7 +10,7 @@ import pytest
 from openvocab_occ.errors import AlreadyExistsError, MapError, NotFoundError
 from openvocab_occ.io.files import sha256
 from openvocab_occ.mapping import VoxelMap
-from openvocab_occ.objects import SceneMap, group_objects
+from openvocab_occ.objects import ObjectTree, SceneMap, group_objects
 from openvocab_occ.objects.map_files import FILES
 
 
@@ -66,6 +66,15 @@ def test_a_map_comes_back_as_it_was(scene, saved):
     assert asdict(back.encoder) == asdict(scene.encoder)
     assert asdict(back.provenance) == asdict(scene.provenance)
     assert back.class_names == scene.class_names
+
+
+def test_colours_of_things_come_back(scene, tmp_path):
+    first, *others = scene.objects.nodes[1:]
+    shown = np.array([[0.75, 200, 20, 20], [0.25, 16, 18, 22]], np.float32)
+    nodes = [scene.objects.root, replace(first, colors=shown), *others]
+    back = SceneMap.open(replace(scene, objects=ObjectTree(nodes)).save(tmp_path / "painted.ovmap"))
+    np.testing.assert_array_equal(back.objects[first.id].colors, shown)
+    assert all(back.objects[node.id].colors is None for node in others if node.colors is None)
 
 
 def test_saving_again_adds_no_drift(scene, saved, tmp_path):

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -54,11 +56,18 @@ def test_a_bus_seen_piece_by_piece_did_not_move():
     high = np.array([[3, 2.5], [8, 2.5], [12, 2.5], [12, 2.5], [12, 2.5]], float)
     motion = observe_motion(np.arange(5) * 0.5, low, high, sightings=5, time_observed=2.0, voxel_size=0.4)
     assert motion.extent == 8.0  # rear at first, front at last: bounds alone cannot tell
-    from dataclasses import replace
-
     state, _, why = judge(replace(motion, left=0.0), movable=1.0)
     assert state == "parked"
     assert "5 sightings in 2.0 s" in why
+
+
+def test_nothing_seen_in_pieces_seems_to_move_further_than_it_is_long():
+    """A walker whose first place nobody could look through: 8 m are more than a person, and less than a bus."""
+    motion = replace(seen(line([2] * 8)), left=0.0)
+    assert motion.extent == pytest.approx(8.0)
+    assert judge(motion, movable=1.0, longest=1.2)[0] == "moving"
+    assert judge(motion, movable=1.0, longest=19.0)[0] == "parked"
+    assert judge(motion, movable=1.0)[0] == "parked"
 
 
 def test_uncertainty_grows_with_voxels_and_sureness_with_time():

@@ -153,7 +153,15 @@ def test_bench_and_show(capsys):
     assert run(capsys, "model", "show", demo_model())["contract"] == "dense"
     assert main(["model", "show", str(demo_model())]) == 0
     said = capsys.readouterr().out
-    for part in ("features of each cell", "RGB NCHW", "multiples of 32", "sigmoid(", "not calibrated", "Apache-2.0"):
+    for part in (
+        "features of each cell",
+        "RGB NCHW",
+        "multiples of 32",
+        "sigmoid(",
+        "probability",
+        "synthetic city",
+        "Apache-2.0",
+    ):
         assert part in said
 
 
