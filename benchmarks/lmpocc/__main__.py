@@ -25,6 +25,7 @@ def main(
     out: Path = Path("out/lmpocc"),
     device: str = "cpu",
     threads: int | None = None,
+    seeds: tuple[int, ...] = (),
     docs: Path | None = None,
     report_only: bool = False,
 ) -> None:
@@ -35,6 +36,7 @@ def main(
         out: Folder; stopped, the same command goes on there.
         device: Of the networks.
         threads: Of torch and of kernels.
+        seeds: Only these, once the latents are there: several processes may share the work. All by default.
         docs: A page whose results between two marks are renewed.
         report_only: Only report what is there.
     """
@@ -45,8 +47,10 @@ def main(
     count = threads or os.cpu_count() or 1
     with limit_threads(count):
         if not report_only:
-            run(SCALES[scale], out, device=device, tell=lambda text: print(text, flush=True))
+            run(SCALES[scale], out, device=device, seeds=seeds, tell=lambda text: print(text, flush=True))
     where = f"{platform.machine()}, {count} threads, {device}, {datetime.date.today()}"
+    if seeds:
+        return
     report(SCALES[scale], out, command=f"python -m benchmarks.lmpocc {scale}", where=where, docs=docs)
 
 

@@ -12,15 +12,20 @@ import numpy as np
 import torch
 
 from benchmarks.lmpocc.scales import Scale
-from benchmarks.lmpocc.ways import Way, Weights, trained, ways
+from benchmarks.lmpocc.ways import LONG_TERM, Way, Weights, trained, ways
 from openvocab_occ.io.files import written_file
-from openvocab_occ.networks.lmop import Lmop
+from openvocab_occ.networks.lmop import LOGIT_REACH, Lmop
 from openvocab_occ.networks.predictor import OccupancyNetwork, load_network
+from openvocab_occ.networks.write_gate import load_write_gate
+from openvocab_occ.occupancy import OCC3D_CLASSES
 from openvocab_occ.training.drives import Drive, by_place, city_drives
 from openvocab_occ.training.latents import Latents, cache_latents
 from openvocab_occ.training.loop import FINAL, train_baseline
 from openvocab_occ.training.memory import Writer, evaluate_memory, train_memory
+from openvocab_occ.training.statistics import Row
+from openvocab_occ.training.stream_map import Gate
 from openvocab_occ.training.streams import MemoryConfig, Visit
+from openvocab_occ.training.write_gate import record, train_write_gate
 
 Tell = Callable[[str], None]
 
@@ -33,11 +38,14 @@ class Ground:
     weights: Path
     train: list[Drive]
     test: list[Drive]
+    gate: list[Drive]
     latents: Latents
 
 
-def run(scale: Scale, out: Path, *, device: str = "cpu", tell: Tell = print) -> None:
-    """Do what is not done yet."""
+def run(
+    scale: Scale, out: Path, *, device: str = "cpu", seeds: Sequence[int] | None = None, tell: Tell = print
+) -> None:
+    """Do what is not done yet, of some seeds only if asked: several processes may so share a folder."""
     grounds = {name: _ground(name, scale, out, device, tell) for name in scale.networks}
     for name, ground in grounds.items():
         home = out / name
@@ -46,13 +54,15 @@ def run(scale: Scale, out: Path, *, device: str = "cpu", tell: Tell = print) -> 
         wanted = {w.name: w for w in trained(scale.tables)}
         for way in ways(scale.tables, others[0] if others else ""):
             weights = wanted[way.weights]
-            for seed in scale.seeds:
+            for seed in seeds or scale.seeds:
                 path = home / "results" / f"{way.name}-{seed}.json.gz"
                 if path.exists():
                     continue
                 file = _train(weights, ground, scale, home, seed, device, tell)
                 network = load_network(name, file, memory=True, fusion=weights.fusion, device=device)
-                _evaluate(path, network, ground, way.memory, tell, _writer(way, ground, grounds), way.blind)
+                gate = _gate(network, ground, scale, home, seed, tell) if way.gate else None
+                _evaluate(path, network, ground, way.memory, tell, writer=_writer(way, ground, grounds),
+                          blind=way.blind, gate=gate)  # fmt: skip
 
 
 def _ground(name: str, scale: Scale, out: Path, device: str, tell: Tell) -> Ground:
@@ -68,10 +78,12 @@ def _ground(name: str, scale: Scale, out: Path, device: str, tell: Tell) -> Grou
     network = load_network(name, weights, device=device)
     tell(f"{name}: drives to test on, and latents")
     test = city_drives(scale.test, network.config, out / "drives")
+    gate = city_drives(scale.gate, network.config, out / "drives") if "gate" in scale.tables else []
     module = network.module
     if isinstance(module, Lmop):
         raise TypeError("a baseline has no memory")
-    return Ground(network, weights, train, test, cache_latents(module, [*train, *test], out / name / "latents"))
+    latents = cache_latents(module, [*train, *test, *gate], out / name / "latents")
+    return Ground(network, weights, train, test, gate, latents)
 
 
 def _train(weights: Weights, ground: Ground, scale: Scale, home: Path, seed: int, device: str, tell: Tell) -> Path:
@@ -87,14 +99,24 @@ def _train(weights: Weights, ground: Ground, scale: Scale, home: Path, seed: int
     )  # fmt: skip
 
 
+def _gate(network: OccupancyNetwork, ground: Ground, scale: Scale, home: Path, seed: int, tell: Tell) -> Gate:
+    folder = home / f"gate-{seed}"
+    weights = folder / FINAL
+    if not weights.exists():
+        tell(f"{ground.network.name}: write gate, seed {seed}")
+        recorded = record(network, by_place(ground.gate), ground.latents, LONG_TERM)
+        config = replace(scale.gate_training, seed=seed)
+        train_write_gate(network, recorded, ground.latents, folder, config, progress=_every(tell, "gate"))
+    return load_write_gate(weights).choose
+
+
 def _evaluate(
-    path: Path, network: OccupancyNetwork, ground: Ground, memory: MemoryConfig, tell: Tell,
-    writer: Writer | None = None, blind: bool = False,
-) -> None:  # fmt: skip
+    path: Path, network: OccupancyNetwork, ground: Ground, memory: MemoryConfig, tell: Tell, **how: Any
+) -> None:
     if path.exists():
         return
     started = time.perf_counter()
-    score = evaluate_memory(network, by_place(ground.test), ground.latents, memory, writer=writer, blind=blind)
+    score = evaluate_memory(network, by_place(ground.test), ground.latents, memory, **how)
     with written_file(path) as scratch, gzip.open(scratch, "wt") as stream:
         json.dump(score.to_dict(), stream)
     tell(f"{ground.network.name}: {path.name.removesuffix('.json.gz')}, {time.perf_counter() - started:.0f} s")
@@ -103,6 +125,8 @@ def _evaluate(
 def _writer(way: Way, ground: Ground, grounds: dict[str, Ground]) -> Writer | None:
     if not way.writer:
         return None
+    if way.writer == "truth":
+        return _true_logits
     source = ground if way.writer == "base" else grounds[way.writer]
     head = source.network.module.occ_head
 
@@ -113,7 +137,12 @@ def _writer(way: Way, ground: Ground, grounds: dict[str, Ground]) -> Writer | No
     return write
 
 
-def read_rows(path: Path) -> list[dict[str, Any]]:
+def _true_logits(visits: Sequence[Visit]) -> np.ndarray:
+    sure = LOGIT_REACH * np.eye(len(OCC3D_CLASSES), dtype=np.float32)
+    return np.stack([sure[v.drive.labels[v.frame]] for v in visits])
+
+
+def read_rows(path: Path) -> list[Row]:
     """Read an evaluation."""
     with gzip.open(path, "rt") as stream:
         return json.load(stream)

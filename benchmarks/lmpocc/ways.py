@@ -6,7 +6,7 @@ from openvocab_occ.networks.fusion import FusionKind
 from openvocab_occ.training.streams import MemoryConfig
 
 _TRAINING = MemoryConfig()
-_LONG_TERM = MemoryConfig(prior_from="other_logs", misplaced=0.0)
+LONG_TERM = MemoryConfig(prior_from="other_logs", misplaced=0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,11 +25,14 @@ class Way:
 
     name: str
     weights: str
-    memory: MemoryConfig = _LONG_TERM
+    memory: MemoryConfig = LONG_TERM
     blind: bool = False
     """Read for the regions' sake, but predict with an empty prior."""
     writer: str = ""
-    """`base`: the baseline's own head writes the map. A network's name: that baseline writes it."""
+    """`base`: the baseline's own head writes the map; `truth`: the labels do, the most that any writer could give. A
+    network's name: that baseline writes it."""
+    gate: bool = False
+    """A learned gate writes the map."""
 
 
 HEAD = Weights(name="head", head_only=True)
@@ -63,6 +66,8 @@ def ways(tables: tuple[str, ...], other_network: str = "") -> list[Way]:
         Way(name="all", weights="lmop", memory=_reads(prior_from="all")),
         Way(name="elsewhere", weights="lmop", memory=_reads(misplaced=1.0)),
     ]
+    if "gate" in tables:
+        found += [Way(name="write-gate", weights="lmop", memory=_reads(policy="gate"), gate=True)]
     if "source" in tables:
         found += [Way(name=s, weights="lmop", memory=_reads(prior_from=s)) for s in ("own_log", "other_scenes")]
     if "policies" in tables:
@@ -83,7 +88,7 @@ def ways(tables: tuple[str, ...], other_network: str = "") -> list[Way]:
             Way(name=f"trained-removal-{v}", weights=f"removal-{v}", memory=_reads(dynamic=v)) for v in ("v1", "v2")
         ]
     if "cross" in tables:
-        found += [Way(name="written-by-base", weights="lmop", writer="base")]
+        found += [Way(name=f"written-by-{w}", weights="lmop", writer=w) for w in ("base", "truth")]
         found += (
             [Way(name=f"written-by-{other_network}", weights="lmop", writer=other_network)] if other_network else []
         )

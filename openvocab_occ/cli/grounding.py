@@ -1,5 +1,6 @@
 """`openvocab-occ eval grounding` and `openvocab-occ bench query`."""
 
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -7,9 +8,12 @@ from typing import TYPE_CHECKING, Literal
 from rich.table import Table
 
 from openvocab_occ.cli.output import console, print_json, progress
+from openvocab_occ.errors import ConfigError
 
 if TYPE_CHECKING:
+    from openvocab_occ.datasets.frame import Frame
     from openvocab_occ.evaluation.grounding import Outcome
+    from openvocab_occ.occupancy import OccupancyGrid
 
 
 def grounding(
@@ -18,7 +22,10 @@ def grounding(
     on: Literal["drive", "truth"] = "drive",
     encoder: Path | None = None,
     condition: str = "clear",
-    occupancy: Literal["oracle", "perceived"] = "oracle",
+    occupancy: Literal["oracle", "perceived", "network"] = "oracle",
+    weights: Path | None = None,
+    network: str = "flashocc-tiny",
+    visits: int = 0,
     frames: int = 20,
     misses: bool = False,
     json: bool = False,
@@ -31,7 +38,11 @@ def grounding(
             fault of the queries alone.
         encoder: The 2D model of a drive, an ONNX file; the shipped one by default.
         condition: Of a drive: clear, rain, night, fog or heavy traffic.
-        occupancy: Of a drive: `oracle` is the true grid, `perceived` has errors like a network's.
+        occupancy: Of a drive: `oracle` is the true grid, `perceived` has errors like a network's, `network` is what the
+            network of --weights predicts from the images.
+        weights: Of `occ train`, for --occupancy network.
+        network: As it was trained.
+        visits: Where it has a memory: traversals by others, written to a map that the drive then reads.
         frames: Keyframes of a drive, two a second.
         misses: Print the questions that went wrong.
         json: Print one JSON object.
@@ -52,16 +63,18 @@ def grounding(
         path = encoder or demo_model()
         model, words = load_encoder(path), lexicon_of(path)
         for seed in seeds:
+            source = (
+                occupancy if occupancy != "network" else _network(weights, network, seed, condition, frames, visits)
+            )
             with progress(f"city {seed}") as advance:
-                drive = drive_city(
-                    seed, model, condition=condition, occupancy=occupancy, frames=frames, progress=advance
-                )
+                drive = drive_city(seed, model, condition=condition, occupancy=source, frames=frames, progress=advance)
             outcomes += judge_drive(drive, model, seed, synonyms=words)
     scores = summarize(outcomes)
     wrong = [o for o in outcomes if not o.right]
     facts = {"seeds": list(seeds), "synthetic": True, "map": on, "ece": calibration_of(outcomes)}
     if on == "drive":
         facts |= {"encoder": model.name, "condition": condition, "occupancy": occupancy, "frames": frames}
+        facts |= {"network": network, "weights": str(weights), "visits": visits} if occupancy == "network" else {}
     if json:
         report = {name: asdict(score) for name, score in scores.items()}
         listed = [o.to_dict() for o in wrong] if misses else []
@@ -80,6 +93,38 @@ def grounding(
     for o in wrong if misses else []:
         console().print(f"{o.question.category}: {o.question.text!r}: {o.verdict}, {o.count} named, "
                         f"{len(o.question.wanted)} there, IoU {o.iou:.2f}", markup=False)  # fmt: skip
+
+
+def _network(
+    weights: Path | None, name: str, seed: int, condition: str, frames: int, visits: int
+) -> "Callable[[Frame], OccupancyGrid]":
+    from tempfile import TemporaryDirectory
+
+    from openvocab_occ.datasets.registry import load_sequence
+    from openvocab_occ.networks.predictor import has_memory, load_network
+    from openvocab_occ.training.predict import MapUse, occupancy_of, open_map, predictions
+
+    if weights is None:
+        raise ConfigError("a network needs its weights", expected="--weights of occ train", fix="--occupancy oracle")
+    net = load_network(name, weights, memory=has_memory(weights))
+    if not visits:
+        return occupancy_of(net)
+    if not net.memory:
+        raise ConfigError("these weights have no memory", got=f"--visits {visits}", fix="leave --visits out")
+    folder = TemporaryDirectory(prefix="openvocab-occ-")
+    city = open_map(Path(folder.name) / "city.tiles", net)
+    for visit in range(1, visits + 1):
+        drive = load_sequence("city", seed=seed, traversal=visit, condition=condition, frames=frames)
+        with progress(f"city {seed}, visit {visit} by another") as advance:
+            use = MapUse(log=f"visit-{visit}", agent=f"car-{visit}")
+            for done, _ in enumerate(predictions(net, drive, city, use), start=1):
+                advance(done, frames)
+    read = occupancy_of(net, city)
+
+    def predict(frame: "Frame", _kept: object = folder) -> "OccupancyGrid":  # the map lives as long as who reads it
+        return read(frame)
+
+    return predict
 
 
 def bench_query(*, voxels: int = 1_000_000, dim: int = 512, objects: int = 100_000, json: bool = False) -> None:

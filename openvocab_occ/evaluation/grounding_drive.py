@@ -13,6 +13,7 @@ import numpy as np
 from openvocab_occ.datasets.city import City, Traversal, keyframes
 from openvocab_occ.datasets.city.oracle import perceive
 from openvocab_occ.datasets.city.things import Thing
+from openvocab_occ.datasets.frame import Frame
 from openvocab_occ.datasets.registry import load_sequence
 from openvocab_occ.evaluation.grounding import Outcome, Overlap, judge
 from openvocab_occ.evaluation.grounding_queries import Question, plural, questions_about
@@ -23,13 +24,14 @@ from openvocab_occ.evaluation.words import CLASSES
 from openvocab_occ.mapping import keys_of
 from openvocab_occ.mapping.keys import pack
 from openvocab_occ.objects import SceneMap, SceneObject
+from openvocab_occ.occupancy import OccupancyGrid
 from openvocab_occ.pipeline.build import MapBuilder
 from openvocab_occ.query.find import viewpoint_of
 from openvocab_occ.segmentation.encoder import PixelEncoder
 
 STUFF = ("sky", "road", "sidewalk", "grass")
 """Classes that are no things."""
-Occupancy = Literal["oracle", "perceived"]
+Occupancy = Literal["oracle", "perceived"] | Callable[[Frame], OccupancyGrid]
 _PERIOD = 0.5  # seconds between keyframes
 _CLASS_OF = {kind: name for name, kinds in CLASSES.items() if name not in STUFF for kind in kinds}
 ALSO = {"car": ("van",), "wall": ("building", "fence", "shed"), "building": ("wall", "shed"),
@@ -83,7 +85,8 @@ def drive_city(
         seed: Of the city, and of the errors of perceived occupancy.
         encoder: The 2D model.
         condition: Weather, of the images and of what is perceived.
-        occupancy: `oracle`, the true grid, or `perceived`, with the errors of `city.perceive`.
+        occupancy: `oracle`, the true grid; `perceived`, with the errors of `city.perceive`; or what a network says of
+            a frame.
         route: Of the city.
         frames: Keyframes, two a second.
         progress: Called with the frames done and their number.
@@ -94,6 +97,8 @@ def drive_city(
         seen = frame
         if occupancy == "perceived":
             seen = replace(frame, occupancy=perceive(keyframes.labels(way, frame.index), condition, seed=seed))
+        elif callable(occupancy):
+            seen = replace(frame, occupancy=occupancy(frame))
         builder.integrate(seen)
         record.add(frame, facts, builder)
         if progress is not None:

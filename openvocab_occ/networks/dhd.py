@@ -12,7 +12,8 @@ from openvocab_occ.networks.resnet import BasicBlock, conv3x3
 DHD_S = FlashOccConfig(latent=256)
 SLABS = ((-1.0, 0.6), (0.6, 2.2), (2.2, 5.4))
 """Heights above the ego's ground, metres, whose features are kept apart."""
-_HEIGHT_STEP = 0.1
+HEIGHT_STEP = 0.1
+"""Metres between the bins of the height distribution, the first of which is the lowest slab's floor."""
 
 
 def camera_vector(rig: Rig) -> Float[Tensor, "bn 27"]:
@@ -230,8 +231,8 @@ class Dhd(FlashOcc):
 
     def __init__(self, config: FlashOccConfig = DHD_S) -> None:
         super().__init__(config)
-        bins = round((SLABS[-1][1] - SLABS[0][0]) / _HEIGHT_STEP) + 1
-        self.heights = [SLABS[0][0] + i * _HEIGHT_STEP for i in range(bins)]
+        bins = round((SLABS[-1][1] - SLABS[0][0]) / HEIGHT_STEP) + 1
+        self.heights = [SLABS[0][0] + i * HEIGHT_STEP for i in range(bins)]
         height_net = HeightNet(config.neck, bins)
         self.img_view_transformer.add_module("height_net", height_net)  # where public checkpoints have it
         self._height_net = [height_net]  # in a list, so that it is not listed twice
@@ -247,19 +248,26 @@ class Dhd(FlashOcc):
 
     def latent(self, images: Float[Tensor, "b n 3 h w"], rig: Rig) -> Float[Tensor, "b c y x"]:
         """Return the output of the slab fusion."""
+        return self.latent_and_height(images, rig)[0]
+
+    def latent_and_height(
+        self, images: Float[Tensor, "b n 3 h w"], rig: Rig
+    ) -> tuple[Float[Tensor, "b c y x"], Float[Tensor, "b n bins h2 w2"]]:
+        """Return the latent feature, and for the height's own loss the distribution that chose the slabs."""
         view = self.img_view_transformer
         features = self.image_features(images)
         depth, context = view.predict(features)
         points = view.points(rig, features.shape[3:], self.config.image_size)
         bev = view.splat(depth, context, points, view.grid)
         bev = self.img_bev_encoder_neck(self.img_bev_encoder_backbone(bev))
-        kept = self.slab_masks(self._height_net[0](features, rig))
+        height = self._height_net[0](features, rig)
+        kept = self.slab_masks(height)
         encoders = (self.img_voxel_encoder0, self.img_voxel_encoder1, self.img_voxel_encoder2)
         slabs = [
             encoder(view.splat(depth, context * mask.unsqueeze(2), points, grid))
             for encoder, mask, grid in zip(encoders, kept, self.slabs, strict=True)
         ]
-        return self.mix(bev, torch.cat(slabs, dim=1))
+        return self.mix(bev, torch.cat(slabs, dim=1)), height
 
     def slab_masks(self, height: Float[Tensor, "b n bins h w"]) -> list[Bool[Tensor, "b n h w"]]:
         """Tell for each slab which feature pixels lie in it by their likeliest height."""

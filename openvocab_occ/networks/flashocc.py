@@ -44,7 +44,7 @@ class FlashOccConfig:
 M0 = FlashOccConfig()
 M1 = FlashOccConfig(latent=256, depth_range=(1.0, 45.0, 0.5))
 TINY = FlashOccConfig(
-    image_size=(48, 128), latent=48, depth_range=(1.0, 41.0, 1.0), context=32, neck=48, tiny=True,
+    image_size=(48, 128), latent=48, depth_range=(1.0, 41.0, 0.5), context=32, neck=48, tiny=True,
     cell=0.8, shape=(100, 100, 8),
 )  # fmt: skip
 """For tests and CPUs: 0.8 m voxels, six images of 128 x 48."""

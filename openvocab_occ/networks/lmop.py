@@ -11,8 +11,9 @@ from openvocab_occ.networks.flashocc import FlashOcc
 from openvocab_occ.networks.fusion import FusionKind, make_fusion, where_known
 from openvocab_occ.networks.lift_splat import Rig
 
-LOGIT_LIMIT = 12.0
-"""Stored logits are clamped to this before they are read, so that one loud writer does not drown the others."""
+LOGIT_REACH = 9.0
+"""No class counts as further below the likeliest than this: a loud writer does not drown the others. It is what a tile
+map of uint8 holds. Clamping centred logits instead makes classes equal at the top as soon as a network is sure."""
 _LOGIT_SCALE = 0.2  # brings them to the scale of activations
 
 
@@ -82,6 +83,11 @@ class Lmop(nn.Module):
 
 
 def bev_of(prior: Float[Tensor, "b x y z classes"]) -> Float[Tensor, "b zc y x"]:
-    """Put height and class into channels (z first), clamped and scaled: the local prior of Fig. 2."""
-    flat = prior.clamp(-LOGIT_LIMIT, LOGIT_LIMIT) * _LOGIT_SCALE
-    return flat.flatten(3).permute(0, 3, 2, 1)
+    """Put height and class into channels (z first), limited and scaled: the local prior of Fig. 2."""
+    return (limited(prior) * _LOGIT_SCALE).flatten(3).permute(0, 3, 2, 1)
+
+
+def limited(logits: Float[Tensor, "*n classes"], reach: float = LOGIT_REACH) -> Float[Tensor, "*n classes"]:
+    """Return logits about their mean, none further than `reach` below the largest; zeros stay zeros."""
+    below = (logits - logits.amax(dim=-1, keepdim=True)).clamp(min=-reach)
+    return below - below.mean(dim=-1, keepdim=True)

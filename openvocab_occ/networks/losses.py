@@ -1,7 +1,7 @@
 """Losses of the baselines."""
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Integer
 from torch import Tensor, nn
 
 FREQUENCIES = (944004, 1897170, 152386, 2391677, 16957802, 724139, 189027, 2074468, 413451, 2384460, 5916653, 175883646,
@@ -53,6 +53,21 @@ def semantic_scal(
         if bool((target == c).any())
     ]
     return torch.stack(terms).mean() if terms else logits.sum() * 0.0
+
+
+def height_loss(
+    predicted: Float[Tensor, "b n bins h w"], bins: Integer[Tensor, "b n h w"], *, none: int = 255
+) -> Float[Tensor, ""]:
+    """Return the binary cross entropy of a height distribution, summed over bins, averaged over pixels with a height.
+
+    DHD's, after BEVDepth's loss on depths; 0 where no pixel has one.
+    """
+    there = bins != none
+    if not there.any():
+        return predicted.sum() * 0.0
+    p = predicted.movedim(2, -1)[there].float().clamp(1e-6, 1 - 1e-6)
+    target = nn.functional.one_hot(bins[there].long(), p.shape[-1]).float()
+    return nn.functional.binary_cross_entropy(p, target, reduction="sum") / there.sum()
 
 
 def _affinity(p: Float[Tensor, " n"], target: Float[Tensor, " n"]) -> Float[Tensor, ""]:

@@ -130,6 +130,9 @@ class OnnxNetwork:
         out = np.asarray(found, np.float32)
         if out.shape != (1, *shape):
             raise ShapeError(f"{self.path.name} gives no logits of its grid", expected=(1, *shape), got=out.shape)
+        if not np.isfinite(out).all():
+            raise ModelError(f"{self.path.name} gives no numbers for frame {frame.index}", expected="finite logits",
+                             fix="look at the model, and at K and poses of the cameras")  # fmt: skip
         return out[0]
 
     def _config(self) -> FlashOccConfig:

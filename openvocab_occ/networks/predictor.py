@@ -138,8 +138,14 @@ class OccupancyNetwork:
                 raise ConfigError("this network has no memory", got="a prior", fix="load_network(..., memory=True)")
             else:
                 logits = self.module(images.to(device), rig.to(device))
-        except torch.OutOfMemoryError as error:
-            raise ModelError(f"{self.name} does not fit into the memory of {device}", got=str(error).splitlines()[0],
+        except (
+            MemoryError,
+            RuntimeError,
+        ) as error:  # torch's own, of a GPU, is a RuntimeError; of a CPU it has no type
+            full = isinstance(error, (MemoryError, torch.OutOfMemoryError)) or "can't allocate memory" in str(error)
+            if not full:
+                raise
+            raise ModelError(f"{self.name} does not fit into the memory of {device}", got=str(error).partition("\n")[0],
                              fix="choose a smaller network or device='cpu'") from error  # fmt: skip
         found = logits[0].float().cpu().numpy()
         if not np.isfinite(found).all():

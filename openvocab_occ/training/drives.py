@@ -81,6 +81,12 @@ class Drive:
                 found[name] = np.ascontiguousarray(found[name][:, x, y, z])
         return found
 
+    @cached_property
+    def began(self) -> float:
+        """Time of the first frame, Unix seconds; read alone."""
+        with np.load(self.path, allow_pickle=False) as content:
+            return float(content["stamps"][0])
+
     def __len__(self) -> int:
         return len(self.stamps)
 
@@ -209,8 +215,8 @@ def city_drives(
 
 
 def by_place(drives: Sequence[Drive]) -> dict[str, list[Drive]]:
-    """Group drives by city, in the order of their visits."""
+    """Group drives by city, in the order of time."""
     places: dict[str, list[Drive]] = {}
-    for drive in sorted(drives, key=lambda d: (d.info.place, d.info.visit, d.info.scene)):
+    for drive in sorted(drives, key=lambda d: (d.info.place, d.began, d.info.scene)):
         places.setdefault(drive.info.place, []).append(drive)
     return places

@@ -14,11 +14,13 @@ from torch import Tensor, nn
 
 from openvocab_occ.errors import ConfigError, DataError, ModelError
 from openvocab_occ.io.files import PathLike
+from openvocab_occ.networks.dhd import Dhd
 from openvocab_occ.networks.flashocc import FlashOcc
 from openvocab_occ.networks.lift_splat import Rig
-from openvocab_occ.networks.losses import geometric_scal, masked_cross_entropy, semantic_scal
+from openvocab_occ.networks.losses import geometric_scal, height_loss, masked_cross_entropy, semantic_scal
 from openvocab_occ.networks.predictor import OccupancyNetwork, normalise
 from openvocab_occ.training.drives import Drive
+from openvocab_occ.training.heights import height_bins
 from openvocab_occ.training.journal import RunJournal, load_checkpoint, save_checkpoint
 
 Advance = Callable[[int, int], None]
@@ -43,7 +45,7 @@ class TrainConfig:
     ema: float = 0.99
     """Of the weights that are kept; shorter at the beginning. 0 keeps the last ones."""
     loss: Literal["flashocc", "dhd"] = "flashocc"
-    """Masked cross entropy, or 10 of it with class weights and 0.2 of each scene-class affinity."""
+    """Masked cross entropy, or 10 of it, 0.2 of each scene-class affinity, and with a Dhd 0.1 of its height's loss."""
     amp: bool = True
     """Work in bfloat16 where that loses little."""
     flip: bool = True
@@ -93,8 +95,15 @@ def train_baseline(
         flips = rng.random(2) < 0.5 if config.flip else np.zeros(2, np.bool_)
         images, rig, labels, mask = batch_of(chosen, flips)
         with told_of_memory(network.name, device), torch.autocast(device.type, torch.bfloat16, enabled=config.amp):
-            logits = module(images.to(device), rig.to(device)).float()
-            loss = loss_of(logits, labels.to(device), mask.to(device), config.loss, weights.to(device))
+            height: Tensor | float = 0.0
+            if isinstance(module, Dhd) and config.loss == "dhd":
+                latent, told = module.latent_and_height(images.to(device), rig.to(device))
+                logits = module.occ_head(latent).float()
+                bins = np.stack([height_bins(d, f, network.config, (told.shape[3], told.shape[4])) for d, f in chosen])
+                height = 0.1 * height_loss(told, torch.from_numpy(bins).to(device))
+            else:
+                logits = module(images.to(device), rig.to(device)).float()
+            loss = height + loss_of(logits, labels.to(device), mask.to(device), config.loss, weights.to(device))
             run.learn(loss, rate_at(step, config), config.clip, config.ema)
         if run.step % config.save_every == 0 or run.step == config.steps:
             run.save()
@@ -189,7 +198,7 @@ def loss_of(
     kind: Literal["flashocc", "dhd"],
     weights: Float[Tensor, " classes"],
 ) -> Float[Tensor, ""]:
-    """Return the loss of a baseline."""
+    """Return the loss of a baseline's logits; a Dhd's height has its own."""
     entropy = masked_cross_entropy(logits, labels.long(), mask, weights=weights)
     if kind == "flashocc":
         return entropy

@@ -24,6 +24,7 @@ from openvocab_occ.occupancy import OccupancyGrid
 from openvocab_occ.training.drives import Drive
 from openvocab_occ.training.latents import Latents
 from openvocab_occ.training.loop import Run, TrainConfig, class_weights, loss_of, rate_at, told_of_memory
+from openvocab_occ.training.stream_map import Gate
 from openvocab_occ.training.streams import (
     MemoryConfig,
     PriorSource,
@@ -111,20 +112,27 @@ def train_memory(
 
 @dataclass
 class MemoryScore:
-    """Confusions by place, visit and condition: of what cameras see, with and without prior, and of the hidden."""
+    """Confusions by place, visit and condition: of what cameras see, with and without prior, the hidden, the map.
+
+    `map` compares the likeliest classes of the prior itself with the truth of that moment, where the map knows
+    something that is not inside a thing.
+    """
 
     parts: dict[tuple[str, int, str], dict[str, OccupancyScore]] = field(default_factory=dict)
 
-    def add(self, visit: Visit, predicted: np.ndarray, known: np.ndarray) -> None:
-        """Count a frame."""
+    def add(self, visit: Visit, predicted: np.ndarray, known: np.ndarray, remembered: np.ndarray | None = None) -> None:
+        """Count a frame; `remembered` are the labels of the map."""
         info = visit.drive.info
         order = visit.stream.drives.index(visit.drive)
         scores = self.parts.setdefault((info.place, order, info.condition), {k: OccupancyScore() for k in REGIONS})
         truth, mask = visit.drive.labels[visit.frame], visit.drive.mask[visit.frame]
-        regions = {"seen": mask, "covered": mask & known, "uncovered": mask & ~known,
-                   "hidden": hidden(truth, mask), "hidden_covered": hidden(truth, mask) & known}  # fmt: skip
+        unseen = hidden(truth, mask)
+        regions = {"seen": mask, "covered": mask & known, "uncovered": mask & ~known, "hidden": unseen,
+                   "hidden_covered": unseen & known}  # fmt: skip
         for name, region in regions.items():
             scores[name].add(predicted, truth, region)
+        if remembered is not None:
+            scores["map"].add(remembered, truth, (mask | unseen) & known)
 
     def total(self, region: str, condition: str | None = None) -> OccupancyScore:
         """Add up all places and visits, or those of a condition."""
@@ -139,7 +147,7 @@ class MemoryScore:
         conditions = sorted({condition for _, _, condition in self.parts if condition})
         return {
             "seen": self.total("seen").to_dict(), "with_prior": self.total("covered").to_dict(),
-            "without_prior": self.total("uncovered").to_dict(),
+            "without_prior": self.total("uncovered").to_dict(), "map": self.total("map").to_dict(),
             "by_condition": {name: self.total("seen", name).to_dict() for name in conditions},
         }  # fmt: skip
 
@@ -152,7 +160,7 @@ class MemoryScore:
         ]  # fmt: skip
 
 
-REGIONS = ("seen", "covered", "uncovered", "hidden", "hidden_covered")
+REGIONS = ("seen", "covered", "uncovered", "hidden", "hidden_covered", "map")
 
 
 class RayCounter:
@@ -162,8 +170,9 @@ class RayCounter:
         self.spec = network.spec
         self.score = RayScore()
 
-    def __call__(self, visit: Visit, labels: np.ndarray) -> None:
+    def __call__(self, visit: Visit, logits: np.ndarray) -> None:
         """Count a frame."""
+        labels = logits.argmax(axis=-1).astype(np.uint8)
         truth = OccupancyGrid(visit.drive.labels[visit.frame], self.spec)
         self.score.add(OccupancyGrid(labels, self.spec), truth, visit.drive.origins[visit.frame][None])
 
@@ -179,6 +188,7 @@ def evaluate_memory(
     seed: int = 0,
     writer: Writer | None = None,
     blind: bool = False,
+    gate: Gate | None = None,
     observer: Callable[[Visit, np.ndarray], None] | None = None,
     progress: Advance | None = None,
 ) -> MemoryScore:
@@ -193,7 +203,8 @@ def evaluate_memory(
         seed: Of pose noise.
         writer: Gives the logits that are written in place of the network's own: a prior of another model.
         blind: Give the network an empty prior all the same: a control that is judged in the same regions.
-        observer: Told of the labels of each frame.
+        gate: With the policy `gate`: chooses how much of old and new is stored.
+        observer: Told of the logits of each frame.
         progress: Told of frames.
     """
     module = network.module.eval()
@@ -204,11 +215,12 @@ def evaluate_memory(
     memory = replace(memory, misplaced=float(memory.misplaced == 1.0))
     for visits in batches(make_streams(places, network.config), batch):
         current = latents.of([(v.drive, v.frame) for v in visits]).to(device)
-        known = np.zeros((len(visits), *network.config.shape), np.bool_)
+        known, remembered = np.zeros((len(visits), *network.config.shape), np.bool_), None
         with torch.autocast(device.type, torch.bfloat16):
             if isinstance(module, Lmop):
                 prior, seen = _priors(visits, memory, {}, rng, training=False)
                 known = seen.numpy()
+                remembered = None if memory.misplaced else prior.numpy().argmax(axis=-1).astype(np.uint8)
                 if blind:
                     prior, seen = torch.zeros_like(prior), torch.zeros_like(seen)
                 logits = module.refine(current, prior.to(device), seen.to(device))
@@ -217,12 +229,12 @@ def evaluate_memory(
         found = logits.float().cpu().numpy()
         labels = found.argmax(axis=-1).astype(np.uint8)
         for b, v in enumerate(visits):
-            score.add(v, labels[b], known[b])
+            score.add(v, labels[b], known[b], None if remembered is None else remembered[b])
             if observer is not None:
-                observer(v, labels[b])
+                observer(v, found[b])
         if isinstance(module, Lmop) and memory.prior_from != "none":
             told = found if writer is None else writer(visits)
-            write_back(visits, told, network, memory, own=memory.prior_from == "own_log")
+            write_back(visits, told, network, memory, gate=gate, own=memory.prior_from == "own_log")
         done += len(visits)
         if progress is not None:
             progress(done, total)
@@ -230,14 +242,16 @@ def evaluate_memory(
 
 
 def write_back(
-    visits: Sequence[Visit], logits: np.ndarray, network: OccupancyNetwork, memory: MemoryConfig, *, own: bool = False
-) -> None:
+    visits: Sequence[Visit], logits: np.ndarray, network: OccupancyNetwork, memory: MemoryConfig, *,
+    gate: Gate | None = None, own: bool = False,
+) -> None:  # fmt: skip
     """Write predictions into the streams' maps, what is seen of them; read before write is the caller's order."""
     labels = logits.argmax(axis=-1).astype(np.uint8)
     for b, visit in enumerate(visits):
         mask = written_mask(visit, labels[b], network.config, memory.mask_from)
         kept = without_dynamic(logits[b], mask, memory.dynamic, seed=visit.frame)
-        visit.stream.write(visit.T_world_ego, kept, mask, memory.policy, own=own)
+        stamp = float(visit.drive.stamps[visit.frame])
+        visit.stream.write(visit.T_world_ego, kept, mask, memory.policy, gate=gate, stamp=stamp, own=own)
 
 
 def _priors(

@@ -136,6 +136,20 @@ def write_predictions(
     return found
 
 
+def occupancy_of(
+    network: OccupancyNetwork | OnnxNetwork, city: TileMap | None = None
+) -> Callable[[Frame], OccupancyGrid]:
+    """Return what gives a frame the grid that files of `write_predictions` would, reading a map but not writing it."""
+    if city is not None:
+        check_map(city, network)
+
+    def predict(frame: Frame) -> OccupancyGrid:
+        prior = city.read(frame.T_world_ego, network.spec) if city is not None and network.memory else None
+        return OccupancyGrid(occ3d_labels(network.predict(frame, prior), network), OCC3D_SPEC, frame.T_world_ego)
+
+    return predict
+
+
 def occ3d_labels(
     logits: Float32[np.ndarray, "x y z classes"], network: OccupancyNetwork | OnnxNetwork
 ) -> UInt8[np.ndarray, "200 200 16"]:

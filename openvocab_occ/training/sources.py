@@ -12,7 +12,7 @@ from openvocab_occ.io.files import PathLike
 from openvocab_occ.networks.flashocc import FlashOccConfig
 from openvocab_occ.occupancy import read_occ3d_masks
 from openvocab_occ.training.drives import Advance, Drive, DriveInfo, write_drive
-from openvocab_occ.training.samples import CameraMasks
+from openvocab_occ.training.samples import CameraMasks, network_spec
 
 _CONDITIONS = ("night", "rain")  # words of nuScenes' descriptions; the first that is found counts
 
@@ -41,7 +41,7 @@ def drives_of(
         path = Path(folder) / f"{info.name}.npz"
         if not path.exists():
             write_drive(path, sequence, info, config, masks=None if masks is None else published(masks, sequence.name))
-        found.append(Drive(path))
+        found.append(Drive(path, network_spec(config)))
         if progress is not None:
             progress(done + 1, len(sequences))
     return found

@@ -4,21 +4,27 @@ It reads and writes as a TileMap of the same lattice does (a test compares them)
 policies that a map of many vehicles cannot have. Of a pose it uses x, y and heading; heights are the ego's own.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Float32, Float64
 
 from openvocab_occ.errors import ConfigError
 from openvocab_occ.geometry import GridSpec
-from openvocab_occ.networks.lmop import LOGIT_LIMIT
+from openvocab_occ.networks.lmop import LOGIT_REACH, limited
 
 WritePolicy = Literal["newest", "overwrite", "ema", "bayes", "gate"]
 """`newest`: what is seen replaces. `overwrite`: and what is hidden is forgotten (Neural Map Prior's way). `ema`: half
-of each. `bayes`: the sum, limited. `gate`: shares that a network chooses."""
+of each. `bayes`: the sum, limited. `gate`: shares of both that a network chooses for each voxel."""
+Gate = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+"""From new logits [n, classes], old ones (0 where nothing was known) and facts [n, 3] to the shares [n, 2] of old and
+new in what is stored. Facts: how often the voxel was written, days since the last time, metres from the ego."""
 EMA_SHARE = 0.5
-BAYES_LIMIT = 20.0
+BAYES_REACH = 20.0  # evidence that has been added up; see networks.lmop.LOGIT_REACH
+DAY = 86400.0  # seconds
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,13 +50,16 @@ class StreamMap:
         self.shape = tuple(int(n) for n in np.ceil((high + reach) / self.cell).astype(np.int64) - self._first)
         cells = self.shape[0] * self.shape[1]
         self.values = np.zeros((cells, spec.shape[2], classes), np.float16)
+        self.writes = np.zeros((cells, spec.shape[2]), np.uint8)  # stays at 255
+        self.stamps = np.zeros((cells, spec.shape[2]))
         self.known = np.zeros((cells, spec.shape[2]), np.bool_)
 
     def copy(self) -> "StreamMap":
         """Return a map that changes on its own."""
         other = object.__new__(StreamMap)
         other.__dict__.update(self.__dict__)
-        other.values, other.known = self.values.copy(), self.known.copy()
+        for name in ("values", "writes", "stamps", "known"):
+            setattr(other, name, getattr(self, name).copy())
         return other
 
     def read(self, T_world_ego: Float[np.ndarray, "4 4"]) -> StreamPrior:
@@ -73,30 +82,53 @@ class StreamMap:
         mask: Bool[np.ndarray, "x y z"],
         *,
         policy: WritePolicy = "newest",
-        gate: Float[np.ndarray, "x y z"] | None = None,
+        gate: Gate | None = None,
+        stamp: float = 0.0,
     ) -> None:
-        """Put logits, of any offset, into every map voxel whose centre lies in a voxel of the mask."""
+        """Put logits, of any offset, into every map voxel whose centre lies in a voxel of the mask.
+
+        Args:
+            T_world_ego: Of the grid.
+            logits: Of every voxel.
+            mask: Which of them are written.
+            policy: What becomes of what was there.
+            gate: With the policy `gate`: chooses the shares of old and new.
+            stamp: Time, Unix seconds; only a gate asks for it.
+        """
         if policy not in get_args(WritePolicy) or (policy == "gate") != (gate is not None):
             raise ConfigError("policy is not known", expected=", ".join(get_args(WritePolicy)), got=policy,
                               fix="a gate goes with policy='gate'")  # fmt: skip
         cells, source = self._footprint(T_world_ego)
         new = logits.reshape(-1, *logits.shape[2:])[source].astype(np.float32)
-        new = np.clip(new - new.mean(axis=-1, keepdims=True), -LOGIT_LIMIT, LOGIT_LIMIT)
+        new = _limited(new, LOGIT_REACH)
         seen = mask.reshape(-1, mask.shape[2])[source]
         old, before = self.values[cells].astype(np.float32), self.known[cells]
         if policy == "ema":
             new = np.where(before[..., None], old + EMA_SHARE * (new - old), new)
         elif policy == "bayes":
-            new = np.clip(old + new, -BAYES_LIMIT, BAYES_LIMIT)
+            new = _limited(old + new, BAYES_REACH)
         elif gate is not None:
-            share = gate.reshape(-1, gate.shape[2])[source][..., None]
-            new = np.where(before[..., None], old + share * (new - old), new)
+            age = np.where(before, np.maximum(stamp - self.stamps[cells], 0) / DAY, 0)
+            reach = np.broadcast_to(self._reach(source)[:, None], age.shape)
+            facts = np.stack([self.writes[cells], age, reach], axis=-1).astype(np.float32)
+            shares = gate(new[seen], old[seen], facts[seen])
+            new[seen] = _limited(shares[:, :1] * old[seen] + shares[:, 1:] * new[seen], BAYES_REACH)
         if policy == "overwrite":
             self.values[cells] = np.where(seen[..., None], new, 0)
             self.known[cells] = seen
+            self.writes[cells] = seen
         else:
             self.values[cells] = np.where(seen[..., None], new, old)
             self.known[cells] = before | seen
+            count = self.writes[cells]
+            self.writes[cells] = np.where(seen & (count < 255), count + 1, count)
+        self.stamps[cells] = np.where(seen, stamp, self.stamps[cells])
+
+    def _reach(self, columns: np.ndarray) -> np.ndarray:
+        """Return the distance of grid columns from the ego, metres."""
+        i, j = np.divmod(columns, self.spec.shape[1])
+        corner = np.asarray(self.spec.origin)
+        return np.hypot(corner[0] + (i + 0.5) * self.cell, corner[1] + (j + 0.5) * self.cell)
 
     def _footprint(self, T: Float[np.ndarray, "4 4"]) -> tuple[np.ndarray, np.ndarray]:
         """Return the flat map cells under a grid at a pose, and the flat grid column of each."""
@@ -119,3 +151,7 @@ class StreamMap:
         x, y = (corner[k] + (np.arange(counts[k]) + 0.5) * self.cell for k in range(2))
         X, Y = np.meshgrid(x, y, indexing="ij")
         return X, Y
+
+
+def _limited(logits: np.ndarray, reach: float) -> np.ndarray:
+    return limited(torch.from_numpy(logits), reach).numpy()

@@ -15,7 +15,7 @@ from openvocab_occ.networks.predictor import OccupancyNetwork
 from openvocab_occ.occupancy import OCC3D_CLASSES, OCC3D_FREE, OccupancyGrid, visibility_mask
 from openvocab_occ.training.drives import Drive
 from openvocab_occ.training.samples import network_spec
-from openvocab_occ.training.stream_map import StreamMap, StreamPrior, WritePolicy
+from openvocab_occ.training.stream_map import Gate, StreamMap, StreamPrior, WritePolicy
 
 PriorSource = Literal["all", "other_scenes", "other_logs", "own_log", "none"]
 """Whose writes a frame reads: everyone's before it (the paper's protocol, mostly the same drive's last frames), those
@@ -94,11 +94,10 @@ class Stream:
         return maps[source].read(T_world_ego)
 
     def write(self, T: Float[np.ndarray, "4 4"], logits: np.ndarray, mask: np.ndarray, policy: WritePolicy,
-              gate: np.ndarray | None = None, *, own: bool = False) -> None:  # fmt: skip
+              *, gate: Gate | None = None, stamp: float = 0.0, own: bool = False) -> None:  # fmt: skip
         """Put what a frame saw into the maps that later frames read; `own` is kept only for who asks for it."""
-        self.live.write(T, logits, mask, policy=policy, gate=gate)
-        if own:
-            self._own.write(T, logits, mask, policy=policy, gate=gate)
+        for city in (self.live, self._own) if own else (self.live,):
+            city.write(T, logits, mask, policy=policy, gate=gate, stamp=stamp)
 
 
 def make_streams(

@@ -153,9 +153,9 @@ def test_rays_count_every_frame(trained, places, latents):
     counter = RayCounter(network)
     perfect = RayCounter(network)
 
-    def observe(visit, labels):
-        counter(visit, labels)
-        perfect(visit, visit.drive.labels[visit.frame])
+    def observe(visit, logits):
+        counter(visit, logits)
+        perfect(visit, np.eye(18, dtype=np.float32)[visit.drive.labels[visit.frame]])
 
     evaluate_memory(network, {"city-100": places["city-100"][:1]}, latents, READ, observer=observe)
     assert perfect.score.value == 1.0

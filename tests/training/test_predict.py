@@ -19,7 +19,15 @@ from openvocab_occ.occupancy import OCC3D_CLASSES, OCC3D_FREE
 from openvocab_occ.training.latents import cache_latents
 from openvocab_occ.training.loop import TrainConfig
 from openvocab_occ.training.memory import train_memory
-from openvocab_occ.training.predict import MapUse, check_map, occ3d_labels, open_map, predictions, write_predictions
+from openvocab_occ.training.predict import (
+    MapUse,
+    check_map,
+    occ3d_labels,
+    occupancy_of,
+    open_map,
+    predictions,
+    write_predictions,
+)
 from openvocab_occ.training.statistics import Outcome, chosen, gain, outcome_of
 
 from .conftest import PLAN, drive_frames
@@ -45,6 +53,21 @@ def test_submission_files_are_read_back(baseline, tmp_path):
         np.testing.assert_array_equal(frame.occupancy.labels, expected)
         assert expected[:50].min() == OCC3D_FREE  # beyond the network's reach
         assert (expected[50:150:2, 50:150:2, ::2] == network.predict(given).argmax(-1)).all()
+
+
+def test_grids_given_to_a_map_are_those_of_the_files(memory, tmp_path, capsys):
+    network, frames = load_network("flashocc-micro", memory, memory=True), drive_frames(1)
+    city = open_map(tmp_path / "c.tiles", network)
+    write_predictions(network, drive_frames(1, day=1), tmp_path / "other", city, MapUse(log="b"))
+    write_predictions(network, frames, tmp_path / "mine", city, MapUse(log="a", write=False))
+    give = occupancy_of(network, city)
+    for frame in join_occupancy(frames, str(tmp_path / "mine" / "{token}.npz")):
+        grid = give(frame)
+        np.testing.assert_array_equal(grid.labels, frame.occupancy.labels)
+        np.testing.assert_array_equal(grid.T_world_grid, frame.occupancy.T_world_grid)
+    assert set(city.logs()) == {"b"}
+    assert main(["eval", "grounding", "--seeds", "1", "--occupancy", "network"]) == 2
+    assert "--weights" in capsys.readouterr().err
 
 
 def test_second_drive_remembers_the_first(memory, tmp_path):
@@ -97,6 +120,48 @@ def test_missing_cameras_are_told(baseline):
         next(predictions(network, drive_frames(1, cameras=1), cameras=network.cameras))
 
 
+@pytest.mark.parametrize(
+    "error", [torch.OutOfMemoryError("CUDA out of memory"), MemoryError(),
+              RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried")]
+)  # fmt: skip
+def test_out_of_memory_names_the_remedy(baseline, monkeypatch, error):
+    def full(*_):
+        raise error
+
+    network = load_network("flashocc-micro", baseline)
+    monkeypatch.setattr(network.module, "forward", full)
+    with pytest.raises(ModelError, match=r"does not fit into the memory of cpu.*smaller network"):
+        network.predict(drive_frames(1)[0])
+
+
+def test_other_failures_are_not_taken_for_it(baseline, monkeypatch):
+    def broken(*_):
+        raise RuntimeError("shapes differ")
+
+    network = load_network("flashocc-micro", baseline)
+    monkeypatch.setattr(network.module, "forward", broken)
+    with pytest.raises(RuntimeError, match="shapes differ"):
+        network.predict(drive_frames(1)[0])
+
+
+def test_images_of_any_size_are_taken_and_too_small_ones_told(baseline):
+    network = load_network("flashocc-micro", baseline)
+    frame = drive_frames(1)[0]
+    twice = [
+        replace(
+            v, image=v.image.repeat(2, 0).repeat(2, 1), camera=v.camera.resized(2 * v.camera.width, 2 * v.camera.height)
+        )
+        for v in frame.views
+    ]
+    large = network.predict(replace(frame, views=tuple(twice)))
+    assert (large.argmax(-1) == network.predict(frame).argmax(-1)).mean() > 0.98
+    small = [
+        replace(v, image=np.ascontiguousarray(v.image[::16, ::16]), camera=v.camera.resized(8, 3)) for v in frame.views
+    ]
+    with pytest.raises(DataError, match="too small for the network"):
+        next(predictions(network, drive_frames(1).map(lambda f: replace(f, views=tuple(small)))))
+
+
 def test_weights_that_are_no_numbers_are_told(baseline):
     network = load_network("flashocc-micro", baseline)
     with torch.no_grad():
@@ -125,6 +190,28 @@ class TestOnnx:
             np.testing.assert_allclose(exported.predict(frame, given), network.predict(frame, given), atol=2e-4)
         assert np.abs(exported.predict(frame, prior) - exported.predict(frame)).max() > 1e-2
         assert exported.spec == network.spec
+
+    @pytest.mark.parametrize("with_memory", [False, True])
+    def test_dhd_too(self, with_memory, tmp_path):
+        """Its deformable convolution and its slabs have standard operators; close calls of heights may differ."""
+        torch.manual_seed(1)
+        network = load_network("dhd-tiny", memory=with_memory)
+        baseline = network.module.baseline if with_memory else network.module
+        torch.nn.init.normal_(baseline._height_net[0].depth_conv[-1].weight, std=0.5)  # heights that differ by pixel
+        exported = OnnxNetwork(export_onnx(network, tmp_path / "d.onnx", cameras=2))
+        frame = drive_frames(1)[0]
+        rng = np.random.default_rng(0)
+        known = rng.random(network.spec.shape) < 0.5
+        logits = rng.normal(0, 3, (*network.spec.shape, 18)).astype(np.float32) * known[..., None]
+        prior = type("P", (), {"logits": logits, "known": known})() if with_memory else None
+        ours, theirs = network.predict(frame, prior), exported.predict(frame, prior)
+        assert (np.abs(ours - theirs) < 1e-3).mean() > 0.999
+        if not with_memory:  # and a foreign file that gives no numbers is told
+            torch.nn.init.constant_(network.module.occ_head.predicter[-1].bias, float("nan"))
+            broken = OnnxNetwork(export_onnx(network, tmp_path / "n.onnx", cameras=2))
+            with pytest.raises(ModelError, match="gives no numbers"):
+                broken.predict(frame)
+        assert ours.std() > 1e-3
 
     def test_runs_with_the_map_as_ours_do(self, pair, tmp_path):
         network, exported = pair
@@ -201,7 +288,7 @@ def test_experiments_end_in_tables(drives, tmp_path, monkeypatch):
     from benchmarks.lmpocc import experiments, report, scales
 
     (tmp_path / "drives").symlink_to(drives[0].path.parent)
-    scale = replace(scales.SMOKE, tables=("II",))
+    scale = replace(scales.SMOKE, tables=("II", "gate"), gate=PLAN)
     assert list(scale.train.drives()) == list(PLAN.drives())
     scale = replace(scale, test=PLAN)
     said: list[str] = []
@@ -210,7 +297,8 @@ def test_experiments_end_in_tables(drives, tmp_path, monkeypatch):
     page.write_text(f"before\n{report.BEGIN}\nold\n{report.END}\nafter\n")
     found = report.report(scale, tmp_path, command="c", where="w", docs=page)
     numbers = found["flashocc-micro"]
-    assert set(numbers["ways"]) == {"base", "head", "empty", "other_logs", "all", "elsewhere"}
+    assert set(numbers["ways"]) == {"base", "head", "empty", "other_logs", "all", "elsewhere", "write-gate"}
+    assert set(numbers["map_gains"]) == {"write-gate"}
     assert len(numbers["bars"]) == 4
     text = page.read_text()
     assert text.startswith("before")
