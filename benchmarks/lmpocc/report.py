@@ -195,7 +195,7 @@ def _plots(found: dict[str, Any], out: Path, name: str) -> None:
     from matplotlib import pyplot as plt
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
-    for group, color in (("static", "tab:green"), ("dynamic", "tab:red")):
+    for group, color in (("static", "tab:blue"), ("dynamic", "tab:orange")):
         visits = sorted(found["by_visit"])
         points = [found["by_visit"][v][group] for v in visits]
         _errors(left, visits, points, color, group)
