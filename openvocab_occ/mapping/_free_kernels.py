@@ -6,6 +6,10 @@ import numpy as np
 
 from openvocab_occ._jit import kernel
 
+_TOLERANCE = 1e-6
+"""Voxels. A centre this little above a face of the grid counts as below it, as where voxels are covered: in a grid half
+a voxel off the lattice roofs would else be taken for the air above them."""
+
 
 @kernel
 @no_type_check
@@ -54,6 +58,7 @@ def keep_free(origin, cell, T_grid_world, free, start, stop, out):
                             + T_grid_world[0, 1] * y
                             + T_grid_world[0, 2] * z
                             + T_grid_world[0, 3]
+                            - _TOLERANCE
                         )
                     )
                     b = int(
@@ -62,6 +67,7 @@ def keep_free(origin, cell, T_grid_world, free, start, stop, out):
                             + T_grid_world[1, 1] * y
                             + T_grid_world[1, 2] * z
                             + T_grid_world[1, 3]
+                            - _TOLERANCE
                         )
                     )
                     c = int(
@@ -70,6 +76,7 @@ def keep_free(origin, cell, T_grid_world, free, start, stop, out):
                             + T_grid_world[2, 1] * y
                             + T_grid_world[2, 2] * z
                             + T_grid_world[2, 3]
+                            - _TOLERANCE
                         )
                     )
                     inside = 0 <= a < free.shape[0] and 0 <= b < free.shape[1] and 0 <= c < free.shape[2]

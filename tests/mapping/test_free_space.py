@@ -7,6 +7,7 @@ from openvocab_occ.depth.render import render_depth
 from openvocab_occ.errors import ConfigError
 from openvocab_occ.geometry import Camera, GridSpec, look_at
 from openvocab_occ.mapping import FreeSpace, keys_of
+from openvocab_occ.mapping.cover import cover_grid
 from openvocab_occ.occupancy import OccupancyGrid
 
 K = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
@@ -40,6 +41,20 @@ def test_what_lies_before_the_wall_is_free_and_nothing_else(distortion):
     clear = cam.inside(pixels) & (depth < 5.2) & (depth > 0.5)
     assert count[clear].all()
     assert not count[~cam.inside(pixels)].any()
+
+
+@pytest.mark.parametrize("height", range(1, 12))
+@pytest.mark.parametrize("origin", [-1.0, -0.2, 0.2, 0.6, -1.1])
+def test_roofs_of_a_grid_off_the_lattice_are_not_taken_for_air(origin, height):
+    """Occ3D's grid begins at -1.0: its layers lie half a voxel off those of a map."""
+    labels = np.full((30, 20, 14), 17, np.uint8)
+    labels[15:20, 5:15, :height] = 4
+    grid = OccupancyGrid(labels, GridSpec((0.0, -4.0, origin), 0.4, labels.shape))
+    top = origin + 0.4 * height
+    space = observed(grid, Camera(K, 64, 48, look_at((0.2, 0.1, top + 0.7), (7.0, 0.1, top))))
+    things = np.flatnonzero(labels.reshape(-1) == 4)
+    assert not space.count(cover_grid(things, grid, 0.4).keys).any()
+    assert space.blocks[1].any()
 
 
 def test_unknown_voxels_are_transparent_and_never_clear():
