@@ -21,7 +21,6 @@ from openvocab_occ.query import score_voxels
 from openvocab_occ.query.find import find
 from openvocab_occ.query.relations import Viewpoint
 
-
 LABELS = ("road", "curb", "truck", "traffic cone", "bus", "person")
 
 
