@@ -18,6 +18,8 @@ class State(NamedTuple):
 
 SKY = State("sky", "", "", "")
 UNSURE = -1
+REPAINTED = "?"
+"""Colour of a thing whose picture was painted over in training: what it is stays, what colour it has is unsure."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +51,10 @@ def thing_truth(lexicon: dict, thing: str, states: list[State]) -> np.ndarray:
 
 
 def color_truth(color: str, states: list[State]) -> np.ndarray:
-    """Return 1 where the thing has the colour; grey and silver are unsure of each other."""
+    """Return 1 where the thing has the colour; grey and silver are unsure of each other, repainted things of all."""
     close = {"grey": {"silver"}, "silver": {"grey", "white"}, "white": {"silver", "beige"}, "beige": {"white"}}
-    found = [1 if s.color == color else UNSURE if s.color in close.get(color, ()) else 0 for s in states]
+    unsure = {REPAINTED, *close.get(color, ())}
+    found = [1 if s.color == color else UNSURE if s.color in unsure else 0 for s in states]
     return np.array(found, dtype=np.int8)
 
 

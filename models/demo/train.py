@@ -19,6 +19,7 @@ import torch
 import yaml
 from network import Segmenter, WordHead
 from phrases import UNSURE, State, build, kinds_of
+from repaint import Repainter
 from scenes import CACHE, TRAINING, VALIDATION
 from torch.nn import functional
 from words import Words
@@ -41,8 +42,10 @@ _CLASS_OF = {kind: number for number, kinds in enumerate(CLASSES.values()) for k
 class Drives:
     """Cached pictures and states, in one numbering of states."""
 
-    def __init__(self, seeds: tuple[int, ...]) -> None:
-        self._seeds, self.states = seeds, []
+    def __init__(self, seeds: tuple[int, ...], lexicon: dict) -> None:
+        self._seeds, self._lexicon, self.states = seeds, lexicon, []
+        self._repaint: Repainter | None = None
+        self.repainted = np.zeros(0, np.int64)
         self._where: dict[int, list[int]] = {}
         self.images: list[np.ndarray] = []
         self.numbers: list[np.ndarray] = []
@@ -65,6 +68,10 @@ class Drives:
                         self._where.setdefault(int(number), []).append(len(self.numbers))
                     self.numbers.append(picture)
                 self.images += list(drive["images"])
+        if new:
+            self._repaint = Repainter(self._lexicon, self.states)
+            self.repainted = self._repaint.repainted
+            self._number = {state: number for number, state in enumerate(self.states)}
         return bool(new)
 
     def crop(self, random: np.random.Generator, sought_share: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -82,9 +89,14 @@ class Drives:
             last = [min(int(p), e) for p, e in zip(pixel, last, strict=True)]
         top, left = (int(random.integers(a, b + 1)) for a, b in zip(first, last, strict=True))
         height, width = size
-        part = torch.from_numpy(image[4 * top : 4 * (top + height), 4 * left : 4 * (left + width)].copy())
-        x = part.permute(2, 0, 1).float()[None] / 255
-        y = torch.from_numpy(states[top : top + height, left : left + width].copy())[None, None].float()
+        assert self._repaint is not None, "drives are read before"
+        part, states = self._repaint(
+            image[4 * top : 4 * (top + height), 4 * left : 4 * (left + width)],
+            states[top : top + height, left : left + width],
+            random,
+        )
+        x = torch.from_numpy(part.copy()).permute(2, 0, 1).float()[None] / 255
+        y = torch.from_numpy(states.astype(np.float32))[None, None]
         if zoom != 1:
             x = functional.interpolate(x, CROP, mode="bilinear", antialias=True)
             y = functional.interpolate(y, (CROP[0] // 4, CROP[1] // 4), mode="nearest")
@@ -104,6 +116,7 @@ class Truth:
         self.table = torch.from_numpy(self.phrases.truth.T.copy()).to(device)  # states phrases
         self.vectors = words.mean(self.phrases.texts).to(device)
         count = np.bincount(np.concatenate([n.ravel() for n in drives.numbers]), minlength=len(drives.states))
+        np.maximum.at(count, drives.repainted, count[: len(drives.repainted)])
         kinds = np.unique([s.kind for s in drives.states], return_inverse=True)[1]
         of_kind = np.bincount(kinds, weights=count)[kinds]
         # within a kind its rare colours and parts are seen a little more often
@@ -191,7 +204,7 @@ def train(steps: int, device: str) -> None:
     """Train, or go on training, up to so many steps; the learning rate falls to zero at the last one."""
     torch.manual_seed(0)
     lexicon, words = yaml.safe_load((HERE / "lexicon.yaml").read_text()), Words.read()
-    drives, unseen = Drives(TRAINING), Drives(VALIDATION)
+    drives, unseen = Drives(TRAINING, lexicon), Drives(VALIDATION, lexicon)
     unseen.rescan()
     net, head = Segmenter().to(device, memory_format=torch.channels_last), WordHead(words.dim).to(device)
     weights = [p for p in net.parameters() if p.ndim > 1]
