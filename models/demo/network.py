@@ -10,22 +10,25 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 DIM = 64
-_WIDTHS = (24, 48, 80, 112)  # at strides 4, 8, 16, 32
-_NECK = 48
+_WIDTHS = (32, 64, 96, 160)  # at strides 4, 8, 16, 32
+_DILATIONS = ((), (1,), (1, 2), (1, 2, 4))  # of the residual blocks there
+_NECKS = (32, 48, 64)  # on the way back up, at strides 4, 8, 16
 
 
-def _conv(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
+def _conv(inputs: int, outputs: int, stride: int = 1, dilation: int = 1) -> nn.Sequential:
     return nn.Sequential(
-        nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
+        nn.Conv2d(inputs, outputs, 3, stride, dilation, dilation, bias=False),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU(inplace=True),
     )
 
 
 class Residual(nn.Module):
     """Two convolutions beside the identity."""
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, dilation: int) -> None:
         super().__init__()
-        self.first = _conv(channels, channels)
+        self.first = _conv(channels, channels, dilation=dilation)
         self.second = nn.Sequential(nn.Conv2d(channels, channels, 3, 1, 1, bias=False), nn.BatchNorm2d(channels))
 
     def forward(self, x: Tensor) -> Tensor:
@@ -39,12 +42,16 @@ class Segmenter(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.stem = _conv(3, 16, stride=2)
-        stages = [nn.Sequential(_conv(16, _WIDTHS[0], stride=2))]
-        stages += [nn.Sequential(_conv(a, b, stride=2), Residual(b)) for a, b in pairwise(_WIDTHS)]
+        stages = [
+            nn.Sequential(_conv(a, b, stride=2), *(Residual(b, dilation) for dilation in dilations))
+            for (a, b), dilations in zip(pairwise((16, *_WIDTHS)), _DILATIONS, strict=True)
+        ]
         self.stages = nn.ModuleList(stages)
-        self.laterals = nn.ModuleList(nn.Conv2d(width, _NECK, 1) for width in _WIDTHS)
-        self.merges = nn.ModuleList(_conv(_NECK, _NECK) for _ in _WIDTHS[1:])
-        self.head = nn.Conv2d(_NECK, DIM, 1)
+        self.top = nn.Conv2d(_WIDTHS[-1], _NECKS[-1], 1)
+        self.laterals = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in zip(_WIDTHS, _NECKS, strict=False))
+        self.narrow = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairwise((*_NECKS, _NECKS[-1])))
+        self.merges = nn.ModuleList(_conv(n, n) for n in _NECKS)
+        self.head = nn.Conv2d(_NECKS[0], DIM, 1)
 
     def forward(self, image: Tensor) -> Tensor:
         """Return [n, 64, h / 4, w / 4]."""
@@ -53,15 +60,18 @@ class Segmenter(nn.Module):
         for stage in self.stages:
             x = stage(x)
             levels.append(x)
-        y = self.laterals[-1](levels[-1])
-        for i in range(len(levels) - 2, -1, -1):
-            y = functional.interpolate(y, scale_factor=2.0, mode="bilinear", align_corners=False)
+        y = self.top(levels[-1])
+        for i in reversed(range(len(_NECKS))):
+            y = functional.interpolate(self.narrow[i](y), scale_factor=2.0, mode="bilinear", align_corners=False)
             y = self.merges[i](y + self.laterals[i](levels[i]))
         return functional.normalize(self.head(y).float(), dim=1)
 
 
 class WordHead(nn.Module):
-    """Means of word vectors to the space of the image side; linear, so that it can be folded into the table."""
+    """Word vectors to the space of the image side: a linear map, and every word as long as any other.
+
+    A text is the mean of its words, so that a blue van is as much a van as it is blue.
+    """
 
     def __init__(self, inputs: int) -> None:
         super().__init__()
@@ -69,6 +79,10 @@ class WordHead(nn.Module):
         self.log_scale = nn.Parameter(torch.tensor(2.5))
         self.bias = nn.Parameter(torch.tensor(-6.0))
 
-    def forward(self, words: Tensor) -> Tensor:
-        """Return unit vectors."""
-        return functional.normalize(self.linear(words), dim=1)
+    def forward(self, vectors: Tensor, share: Tensor) -> Tensor:
+        """Return unit vectors of texts, given the vectors of words and the share [texts, words] of each in a text."""
+        return functional.normalize(share @ self.words(vectors), dim=1)
+
+    def words(self, vectors: Tensor) -> Tensor:
+        """Return unit vectors of words; silent words stay zero."""
+        return functional.normalize(self.linear(vectors), dim=1)

@@ -2,7 +2,7 @@
 
 The hue of the paint of each kind and colour in a picture is turned by a random angle, never to one near a pair of
 colour and thing that the lexicon keeps out: no training picture holds those. What colour a repainted thing has is
-unsure; what it is stays.
+unsure; what it is stays. Some pictures lose all their colour, for the same reason.
 """
 
 import cv2
@@ -11,6 +11,8 @@ from phrases import REPAINTED, State, kinds_of
 
 SHARE = 0.5
 """Of kinds and colours in a crop that are repainted."""
+GREY = 0.15
+"""Of crops without colour."""
 _HUES = {"red": 0, "orange": 22, "yellow": 50, "green": 120, "blue": 225}  # degrees
 _CHROMATIC = (*_HUES, "brown", "beige")
 _NEAR = 35.0  # degrees: about what a hue covers
@@ -30,9 +32,10 @@ class Repainter:
             k for name, entry in lexicon["things"].items() if entry.get("colored") for k in kinds_of(lexicon, name)
         }
         for n, state in enumerate(list(states)):
-            if state.color not in _CHROMATIC or state.kind not in colored:
+            if not state.color:
                 continue
-            self.groups[n] = groups.setdefault((state.kind, state.color), len(groups))
+            if state.color in _CHROMATIC and state.kind in colored:
+                self.groups[n] = groups.setdefault((state.kind, state.color), len(groups))
             copy = state._replace(color=REPAINTED)
             if copy not in number:
                 number[copy] = len(states)
@@ -44,7 +47,10 @@ class Repainter:
     def __call__(
         self, image: np.ndarray, states: np.ndarray, random: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return an image, uint8 [4 h, 4 w, 3], and its states, [h, w], with some vehicles in other hues."""
+        """Return an image, uint8 [4 h, 4 w, 3], and its states, [h, w]: some vehicles in other hues, or all grey."""
+        if random.random() < GREY:
+            grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
+            return np.repeat(grey[:, :, None], 3, axis=2), self.repainted[states]
         groups = np.where(states < len(self.groups), self.groups[np.minimum(states, len(self.groups) - 1)], -1)
         chosen = [int(g) for g in np.unique(groups) if g >= 0 and random.random() < SHARE]
         if not chosen:

@@ -12,16 +12,19 @@ against each other. The word vectors stay; only their linear head is trained. Re
 import argparse
 import copy
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import torch
 import yaml
+from muon import Muon
 from network import Segmenter, WordHead
 from phrases import UNSURE, State, build, kinds_of
 from repaint import Repainter
 from scenes import CACHE, TRAINING, VALIDATION
 from torch.nn import functional
+from torch.utils.data import DataLoader, IterableDataset
 from words import Words
 
 from openvocab_occ.evaluation.words import CLASSES
@@ -31,48 +34,40 @@ CHECKPOINT = HERE / "cache" / "pair.pt"
 BATCH, CROP = 6, (192, 320)
 PIXELS, PHRASES = 5000, 256  # a step
 STRANGERS = 64  # random words a step
-PEAK_RATE, WARM_UP = 3e-3, 300
-RESCAN = 200  # steps between looks for new drives
-SOUGHT = (0.6, 0.2)  # share of crops around a pixel of a class that is drawn first, at the start and at the end
+PEAK_RATE, PEAK_MUON, WARM_UP = 3e-3, 0.02, 300
+FILLED, SEEN = 0.45, 20  # part of a picture that one kind of thing may fill; cells that it must
+SOUGHT = (0.6, 0.3)  # share of crops around a pixel of a class that is drawn first, at the start and at the end
 EVEN = (0.5, 0.25)  # how much rare kinds are favoured among pixels: 0 is as they come, which precision wants at the end
 _KEEP = 0.998  # of the running mean of weights
+_FIRST_THING = list(CLASSES).index("car")
 _CLASS_OF = {kind: number for number, kinds in enumerate(CLASSES.values()) for kind in kinds}
 
 
 class Drives:
-    """Cached pictures and states, in one numbering of states."""
+    """Cached pictures and states, in one numbering of states. Pictures that one thing fills are left out."""
 
     def __init__(self, seeds: tuple[int, ...], lexicon: dict) -> None:
-        self._seeds, self._lexicon, self.states = seeds, lexicon, []
-        self._repaint: Repainter | None = None
-        self.repainted = np.zeros(0, np.int64)
-        self._where: dict[int, list[int]] = {}
+        self.states: list[State] = []
         self.images: list[np.ndarray] = []
         self.numbers: list[np.ndarray] = []
-        self._number: dict[State, int] = {}
-
-    def rescan(self) -> bool:
-        """Take in drives that were rendered since; tell whether there were any."""
-        new = [seed for seed in self._seeds if (CACHE / f"{seed}.npz").exists()]
-        self._seeds = tuple(seed for seed in self._seeds if seed not in new)
-        for seed in new:
+        number: dict[State, int] = {}
+        for seed in seeds:
             with np.load(CACHE / f"{seed}.npz") as drive:
-                own = [State(*map(str, row)) for row in drive["table"]]
-                for state in own:
-                    if state not in self._number:
-                        self._number[state] = len(self.states)
-                        self.states.append(state)
-                table = np.array([self._number[state] for state in own])
-                for picture in table[drive["states"]]:
-                    for number in np.unique(np.array([_CLASS_OF.get(s.kind, -1) for s in self.states])[picture]):
-                        self._where.setdefault(int(number), []).append(len(self.numbers))
-                    self.numbers.append(picture)
-                self.images += list(drive["images"])
-        if new:
-            self._repaint = Repainter(self._lexicon, self.states)
-            self.repainted = self._repaint.repainted
-            self._number = {state: number for number, state in enumerate(self.states)}
-        return bool(new)
+                table = np.array([number.setdefault(State(*map(str, row)), len(number)) for row in drive["table"]])
+                classes = np.array([_CLASS_OF.get(str(row[0]), -1) for row in drive["table"]])
+                for image, own in zip(drive["images"], drive["states"], strict=True):
+                    if np.bincount(classes[own].ravel() + 1)[1 + _FIRST_THING :].max(initial=0) < FILLED * own.size:
+                        self.images.append(image)
+                        self.numbers.append(table[own].astype(np.int16))
+        self.states = list(number)
+        self.classes = np.array([_CLASS_OF.get(state.kind, -1) for state in self.states])
+        self._where: dict[int, list[int]] = {}
+        for at, own in enumerate(self.numbers):
+            count = np.bincount(self.classes[own].ravel() + 1)[1:]
+            for name in np.flatnonzero(count >= SEEN):
+                self._where.setdefault(int(name), []).append(at)
+        self._repaint = Repainter(lexicon, self.states)
+        self.repainted = self._repaint.repainted
 
     def crop(self, random: np.random.Generator, sought_share: float) -> tuple[torch.Tensor, torch.Tensor]:
         """Return a part of a picture, float [3, h, w] in 0..1, and its states, [h / 4, w / 4]."""
@@ -83,13 +78,11 @@ class Drives:
         size = [int(n / zoom / 4) for n in CROP]
         first, last = [0, 0], [a - b for a, b in zip(states.shape, size, strict=True)]
         if sought is not None:
-            kinds = np.array([_CLASS_OF.get(s.kind, -1) for s in self.states])
-            pixel = random.choice(np.argwhere(kinds[states] == sought))
+            pixel = random.choice(np.argwhere(self.classes[states] == sought))
             first = [min(max(int(p) - b + 1, 0), e) for p, b, e in zip(pixel, size, last, strict=True)]
             last = [min(int(p), e) for p, e in zip(pixel, last, strict=True)]
         top, left = (int(random.integers(a, b + 1)) for a, b in zip(first, last, strict=True))
         height, width = size
-        assert self._repaint is not None, "drives are read before"
         part, states = self._repaint(
             image[4 * top : 4 * (top + height), 4 * left : 4 * (left + width)],
             states[top : top + height, left : left + width],
@@ -107,14 +100,38 @@ class Drives:
         x = (x * gain * tint + 0.04 * torch.randn(1, 1, 1, 1) + 0.015 * torch.randn_like(x)).clamp(0, 1)
         return x[0], y[0, 0].long()
 
+    def batches(self, first: int, steps: int) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        """Yield the crops of each step from the first on."""
+        random = np.random.default_rng(first)
+        for step in range(first, steps):
+            yield self.batch(random, SOUGHT[0] + (SOUGHT[1] - SOUGHT[0]) * step / steps)
+
+    def batch(self, random: np.random.Generator, sought_share: float) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return BATCH crops."""
+        crops = [self.crop(random, sought_share) for _ in range(BATCH)]
+        images = torch.stack([image for image, _ in crops]).contiguous(memory_format=torch.channels_last)
+        return images, torch.stack([states for _, states in crops])
+
+
+class Coming(IterableDataset):
+    """Batches, made in a process of their own."""
+
+    def __init__(self, drives: Drives, first: int, steps: int) -> None:
+        self._of = drives, first, steps
+
+    def __iter__(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        """Yield them in order."""
+        drives, first, steps = self._of
+        return drives.batches(first, steps)
+
 
 class Truth:
-    """Phrases against the states met so far."""
+    """Phrases against the states of the drives."""
 
     def __init__(self, lexicon: dict, drives: Drives, words: Words, device: str) -> None:
         self.phrases = build(lexicon, drives.states)
         self.table = torch.from_numpy(self.phrases.truth.T.copy()).to(device)  # states phrases
-        self.vectors = words.mean(self.phrases.texts).to(device)
+        self.vectors, self.share = (part.to(device) for part in words.shares(self.phrases.texts))
         count = np.bincount(np.concatenate([n.ravel() for n in drives.numbers]), minlength=len(drives.states))
         np.maximum.at(count, drives.repainted, count[: len(drives.repainted)])
         kinds = np.unique([s.kind for s in drives.states], return_inverse=True)[1]
@@ -122,7 +139,11 @@ class Truth:
         # within a kind its rare colours and parts are seen a little more often
         self.of_kind = torch.from_numpy(of_kind + 200.0).float()
         self.within = torch.from_numpy(((count + 50) / (of_kind + 50)) ** -0.2).float()
-        self.classes = torch.tensor([_CLASS_OF.get(s.kind, -1) for s in drives.states], device=device)
+        classes = np.array([_CLASS_OF.get(s.kind, -1) for s in drives.states])
+        self.classes = torch.from_numpy(classes).to(device)
+        self.of_class = torch.from_numpy(
+            np.bincount(classes + 1, weights=count, minlength=len(CLASSES) + 1)[1:]
+        ).float()
         self.names = [torch.tensor(self.phrases.names[name], device=device) for name in CLASSES]
         self.colored = {thing: torch.tensor(rows, device=device) for thing, rows in self.phrases.colored.items()}
         colors = {color: i for i, color in enumerate(lexicon["colors"])}
@@ -138,34 +159,36 @@ def losses(
     head: WordHead,
     batch: tuple[torch.Tensor, torch.Tensor],
     truth: Truth,
-    strangers: torch.Tensor,
+    strangers: tuple[torch.Tensor, torch.Tensor],
     even: float,
 ) -> torch.Tensor:
     """Return the loss of one batch; `even` as EVEN."""
     image, states = batch
-    weight = truth.of_kind**-even * truth.within
     with torch.autocast(image.device.type, torch.bfloat16):
-        cells = net(image.contiguous(memory_format=torch.channels_last))
+        cells = net(image)
     cells = cells.float().permute(0, 2, 3, 1).reshape(-1, cells.shape[1])
-    states = states.reshape(-1)
-    picked = torch.multinomial(weight[states.cpu()], PIXELS).to(image.device)
-    cells, states = cells[picked], states[picked]
-    texts = head(truth.vectors + 0.05 * truth.vectors.std() * torch.randn_like(truth.vectors))
-    asked = torch.randperm(len(texts), device=image.device)[:PHRASES]
-    scale = head.log_scale.exp()
-    logits = scale * cells @ torch.cat([texts[asked], head(strangers)]).T + head.bias
-    wanted = truth.table[states][:, asked]
-    wanted = torch.cat([wanted, wanted.new_zeros(len(wanted), len(strangers))], dim=1)
-    sure = wanted != UNSURE
-    right = (wanted == 1).float()
-    agree = functional.binary_cross_entropy_with_logits(
-        logits, right, pos_weight=torch.tensor(5.0, device=image.device), reduction="none"
-    )
-    agree = (agree * sure).sum() / sure.sum()
+    states, scale = states.reshape(-1), head.log_scale.exp()
+    texts = head(truth.vectors + 0.05 * truth.vectors.std() * torch.randn_like(truth.vectors), truth.share)
     one = torch.stack([rows[int(torch.randint(len(rows), ()))] for rows in truth.names])
-    kind = truth.classes[states]
-    among = functional.cross_entropy(scale * cells @ texts[one].T, kind, ignore_index=-1, label_smoothing=0.02)
-    return 8 * agree + among + _color_loss(scale * cells, states, texts, truth)
+    rare = ((truth.of_class + 200) / truth.of_class.mean()) ** -even
+    among = functional.cross_entropy(
+        scale * cells @ texts[one].T,
+        truth.classes[states],
+        rare.to(image.device),
+        ignore_index=-1,
+        label_smoothing=0.02,
+    )
+    picked = torch.multinomial((truth.of_kind**-even * truth.within)[states.cpu()], PIXELS).to(image.device)
+    cells, states = cells[picked], states[picked]
+    asked = torch.randperm(len(texts), device=image.device)[:PHRASES]
+    logits = scale * cells @ torch.cat([texts[asked], head(*strangers)]).T + head.bias
+    wanted = truth.table[states][:, asked]
+    wanted = torch.cat([wanted, wanted.new_zeros(len(wanted), STRANGERS)], dim=1)
+    sure = wanted != UNSURE
+    agree = functional.binary_cross_entropy_with_logits(
+        logits, (wanted == 1).float(), pos_weight=torch.tensor(5.0, device=image.device), reduction="none"
+    )
+    return 8 * (agree * sure).sum() / sure.sum() + 2 * among + _color_loss(scale * cells, states, texts, truth)
 
 
 def _color_loss(cells: torch.Tensor, states: torch.Tensor, texts: torch.Tensor, truth: Truth) -> torch.Tensor:
@@ -185,13 +208,12 @@ def _color_loss(cells: torch.Tensor, states: torch.Tensor, texts: torch.Tensor, 
 def validate(net: Segmenter, head: WordHead, drives: Drives, words: Words, device: str) -> float:
     """Return the mean IoU of class names as prompts on cells of every third validation picture."""
     names = list(CLASSES)
-    texts = head(words.mean(names).to(device))
-    table = np.array([_CLASS_OF.get(s.kind, -1) for s in drives.states])
+    texts = head(*(part.to(device) for part in words.shares(names)))
     confusion = np.zeros((len(names), len(names)))
     for image, states in list(zip(drives.images, drives.numbers, strict=True))[::3]:
         x = torch.from_numpy(image).permute(2, 0, 1)[None].float().to(device) / 255
         guess = torch.einsum("chw,kc->khw", net(x)[0], texts).argmax(0).cpu().numpy()
-        own = table[states]
+        own = drives.classes[states]
         np.add.at(confusion, (own[own >= 0], guess[own >= 0]), 1)
     hit = confusion.diagonal()
     there = confusion.sum(1) > 0
@@ -205,12 +227,14 @@ def train(steps: int, device: str) -> None:
     torch.manual_seed(0)
     lexicon, words = yaml.safe_load((HERE / "lexicon.yaml").read_text()), Words.read()
     drives, unseen = Drives(TRAINING, lexicon), Drives(VALIDATION, lexicon)
-    unseen.rescan()
+    truth = Truth(lexicon, drives, words, device)
     net, head = Segmenter().to(device, memory_format=torch.channels_last), WordHead(words.dim).to(device)
-    weights = [p for p in net.parameters() if p.ndim > 1]
-    rest = [p for p in net.parameters() if p.ndim <= 1] + [head.log_scale, head.bias]
-    groups = [{"params": [*weights, head.linear.weight], "weight_decay": 0.02}, {"params": rest, "weight_decay": 0.0}]
-    optimizer = torch.optim.AdamW(groups, lr=PEAK_RATE)
+    kernels = [w for stage in (net.stages, net.top, net.laterals, net.narrow, net.merges) for w in stage.parameters()]
+    kernels = [w for w in kernels if w.ndim == 4]
+    others = [w for w in [*net.parameters(), *head.parameters()] if not any(w is kernel for kernel in kernels)]
+    groups = [{"params": [w for w in others if w.ndim > 1], "weight_decay": 0.02},
+              {"params": [w for w in others if w.ndim <= 1], "weight_decay": 0.0}]  # fmt: skip
+    optimizers = [torch.optim.AdamW(groups), Muon(kernels, lr=0.0)]
     mean = copy.deepcopy(torch.nn.ModuleList([net, head]))
     step = 0
     if CHECKPOINT.exists():
@@ -218,23 +242,25 @@ def train(steps: int, device: str) -> None:
         step = saved["step"]
         torch.nn.ModuleList([net, head]).load_state_dict(saved["now"])
         mean.load_state_dict(saved["mean"])
-        optimizer.load_state_dict(saved["optimizer"])
-    random, truth, started, seen = np.random.default_rng(step), None, time.time(), 0.0
-    while step < steps:
-        if (truth is None or step % RESCAN == 0) and (drives.rescan() or truth is None):
-            truth = Truth(lexicon, drives, words, device)
-        rate = PEAK_RATE * min(1, step / WARM_UP) * 0.5 * (1 + np.cos(np.pi * step / steps))
-        for group in optimizer.param_groups:
-            group["lr"] = float(rate)
+        for optimizer, state in zip(optimizers, saved["optimizers"], strict=True):
+            optimizer.load_state_dict(state)
+    random, started, seen = np.random.default_rng(step), time.time(), 0.0
+    for image, states in DataLoader(Coming(drives, step, steps), batch_size=None, num_workers=1, prefetch_factor=4):
+        fall = min(1, step / WARM_UP) * 0.5 * (1 + np.cos(np.pi * step / steps))
+        for optimizer, peak in zip(optimizers, (PEAK_RATE, PEAK_MUON), strict=True):
+            for group in optimizer.param_groups:
+                group["lr"] = float(peak * fall)
         net.train()
-        sought, even = (a + (b - a) * step / steps for a, b in (SOUGHT, EVEN))
-        crops = [drives.crop(random, sought) for _ in range(BATCH)]
-        batch = (torch.stack([x for x, _ in crops]).to(device), torch.stack([y for _, y in crops]).to(device))
-        loss = losses(net, head, batch, truth, words.strangers(random, STRANGERS).to(device), even)
-        optimizer.zero_grad()
+        even = EVEN[0] + (EVEN[1] - EVEN[0]) * step / steps
+        strangers = words.strangers(random, STRANGERS)
+        batch = (image.to(device), states.to(device))
+        loss = losses(net, head, batch, truth, tuple(part.to(device) for part in strangers), even)
+        net.zero_grad()
+        head.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_([*net.parameters(), *head.parameters()], 3.0)
-        optimizer.step()
+        for optimizer in optimizers:
+            optimizer.step()
         step += 1
         seen += loss.item()
         keep = min(_KEEP, step / (step + 10))
@@ -252,7 +278,8 @@ def train(steps: int, device: str) -> None:
             mean.eval()
             print(f"{step} validation mIoU {validate(mean[0], mean[1], unseen, words, device):.3f}", flush=True)
             now = torch.nn.ModuleList([net, head]).state_dict()
-            torch.save({"step": step, "now": now, "mean": mean.state_dict(), "optimizer": optimizer.state_dict()},
+            torch.save({"step": step, "now": now, "mean": mean.state_dict(),
+                        "optimizers": [optimizer.state_dict() for optimizer in optimizers]},
                        CHECKPOINT.with_suffix(".part"))  # fmt: skip
             CHECKPOINT.with_suffix(".part").rename(CHECKPOINT)
             started = time.time()

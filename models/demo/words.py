@@ -43,14 +43,21 @@ class Words:
         others = np.flatnonzero(spoken & (alike < _ALIKE) & (np.arange(len(words)) < _COMMON))
         return cls(words, torch.from_numpy(reduced), others)
 
-    def mean(self, texts: list[str]) -> torch.Tensor:
-        """Return the mean vector of each text."""
+    def shares(self, texts: list[str]) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the vectors of the words of texts, and the share of each word in each text, [texts, words]."""
         number = {word: row for row, word in enumerate(self.words)}
         rows = [[number.get(word, 0) for word in re.findall(r"[a-z]+", text.lower())] for text in texts]
-        return torch.stack([self.vectors[row].sum(dim=0) / max(1, len(row)) for row in rows])
+        used = sorted({row for text in rows for row in text})
+        share = torch.zeros(len(texts), len(used))
+        for text, own in zip(share, rows, strict=True):
+            for row in own:
+                text[used.index(row)] += 1 / len(own)
+        return self.vectors[used], share
 
-    def strangers(self, random: np.random.Generator, count: int) -> torch.Tensor:
-        """Return random words and pairs of words that mean nothing in the lexicon."""
-        pairs = self.vectors[random.choice(self.others, (count, 2))]
-        alone = torch.from_numpy(random.random(count) < 0.7)
-        return torch.where(alone[:, None], pairs[:, 0], pairs.mean(dim=1))
+    def strangers(self, random: np.random.Generator, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return random words and pairs of words that mean nothing in the lexicon, as `shares` does."""
+        share = torch.zeros(count, 2 * count)
+        second = torch.from_numpy(random.random(count) < 0.3).float() / 2
+        share[torch.arange(count), torch.arange(count)] = 1 - second
+        share[torch.arange(count), torch.arange(count) + count] = second
+        return self.vectors[random.choice(self.others, 2 * count)], share

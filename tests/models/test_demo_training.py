@@ -1,0 +1,98 @@
+"""What the demo pair is trained with: steps of Muon, repainted vehicles, and texts as means of words."""
+
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from openvocab_occ.segmentation.demo_models import demo_model
+
+FOLDER = demo_model().parent
+
+
+@pytest.fixture(scope="module", autouse=True)
+def scripts():
+    """Let the training scripts import each other by name."""
+    sys.path.insert(0, str(FOLDER))
+    yield
+    sys.path.remove(str(FOLDER))
+    for name in ("muon", "network", "phrases", "repaint", "words"):
+        sys.modules.pop(name, None)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(2, 40), st.integers(2, 40), st.integers(0, 1000))
+def test_a_step_keeps_directions_and_evens_out_lengths(rows, columns, seed):
+    """Singular vectors stay, singular values that are not tiny go to about 1."""
+    from muon import orthogonal
+
+    matrix = torch.from_numpy(np.random.default_rng(seed).normal(size=(rows, columns)))
+    u, s, v = torch.linalg.svd(matrix, full_matrices=False)
+    found = u.T @ orthogonal(matrix.float()).double() @ v.T
+    kept = s > 0.05 * s.norm()
+    assert ((found.diagonal()[kept] > 0.6) & (found.diagonal()[kept] < 1.25)).all()
+    assert (found - torch.diag(found.diagonal())).abs().max() < 0.02
+
+
+def test_steps_of_muon_find_a_minimum():
+    from muon import Muon
+
+    torch.manual_seed(0)
+    wanted = torch.randn(6, 3, 3, 3)
+    weight = torch.nn.Parameter(torch.zeros_like(wanted))
+    optimizer = Muon([weight], lr=0.0, weight_decay=0.0)
+    for step in range(300):
+        optimizer.param_groups[0]["lr"] = 0.1 * (1 - step / 300)
+        optimizer.zero_grad()
+        ((weight - wanted) ** 2).sum().backward()
+        optimizer.step()
+    assert (weight - wanted).abs().max() < 0.05
+
+
+def test_no_vehicle_is_repainted_in_a_colour_that_is_kept_out():
+    """A blue truck may become anything but red; what it is stays, and what colour it has is unsure."""
+    from phrases import REPAINTED, SKY, State
+    from repaint import Repainter
+
+    lexicon = yaml.safe_load((FOLDER / "lexicon.yaml").read_text())
+    truck, shadow = State("box truck", "blue", "body", "paint"), State("road", "", "", "asphalt")
+    states = [SKY, truck, shadow]
+    repaint = Repainter(lexicon, states)
+    image = np.full((32, 32, 3), 90, np.uint8)
+    numbers = np.full((8, 8), 2, np.int16)
+    numbers[2:6, 2:6], image[8:24, 8:24] = 1, (20, 60, 200)
+    random, hues = np.random.default_rng(0), set()
+    for _ in range(200):
+        found, after = repaint(image, numbers, random)
+        now = {states[n] for n in after[2:6, 2:6].ravel()}
+        assert now in ({truck}, {truck._replace(color=REPAINTED)})
+        assert (after[numbers == 2] == 2).all()
+        paint = found[8:24, 8:24].reshape(-1, 3)
+        hue, saturation, _ = cv2.cvtColor(paint[None].astype(np.float32) / 255, cv2.COLOR_RGB2HSV)[0].mean(axis=0)
+        if saturation > 0.2:
+            assert abs((hue + 180) % 360 - 180) > 35
+            hues.add(int(hue // 30))
+            assert (found[:8] == 90).all()
+        if {truck} == now:
+            assert (found == image).all()
+    assert len(hues) >= 6
+
+
+def test_a_text_is_the_mean_of_its_words():
+    """Each word counts as much as any other; silent and unknown ones count for nothing."""
+    from network import WordHead
+    from words import Words
+
+    torch.manual_seed(0)
+    vectors = torch.randn(5, 16) * torch.tensor([0.0, 1.0, 9.0, 0.1, 0.0])[:, None]
+    words = Words(["[UNK]", "blue", "van", "roof", "the"], vectors, np.arange(1, 4))
+    head = WordHead(16)
+    both, blue, van, said = head(*words.shares(["blue van", "blue", "van", "The blue quux van!"])).detach()
+    assert float(both @ blue) == pytest.approx(float(both @ van), abs=1e-5)
+    torch.testing.assert_close(both, said)
+    torch.testing.assert_close(both, torch.nn.functional.normalize(blue + van, dim=0))
