@@ -36,7 +36,7 @@ The word table is distilled from all-MiniLM-L6-v2; see NOTICE."""
 
 def table(head: WordHead, words: Words) -> tuple[list[str], np.ndarray, np.ndarray]:
     """Return words, int8 rows and the scale of each, with the linear head folded in; rows of silent words are zero."""
-    rows = head.words(words.vectors).detach().numpy()
+    rows = head.words(words.vectors, words.colors).detach().numpy()
     scale = np.abs(rows).max(axis=1) / 127
     return words.words, np.round(rows / np.maximum(scale, 1e-9)[:, None]).astype(np.int8), scale.astype(np.float32)
 

@@ -10,6 +10,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 DIM = 64
+COLORS = 16
+"""How many of the numbers, the last ones, tell colour; the others tell what a thing is, which part, and its material.
+
+A word speaks of one or the other, so that a colour and a thing that were never seen together still add up."""
 _WIDTHS = (32, 64, 96, 160)  # at strides 4, 8, 16, 32
 _DILATIONS = ((), (1,), (1, 2), (1, 2, 4))  # of the residual blocks there
 _NECKS = (32, 48, 64)  # on the way back up, at strides 4, 8, 16
@@ -64,25 +68,29 @@ class Segmenter(nn.Module):
         for i in reversed(range(len(_NECKS))):
             y = functional.interpolate(self.narrow[i](y), scale_factor=2.0, mode="bilinear", align_corners=False)
             y = self.merges[i](y + self.laterals[i](levels[i]))
-        return functional.normalize(self.head(y).float(), dim=1)
+        look, color = self.head(y).float().split((DIM - COLORS, COLORS), dim=1)
+        return 0.5**0.5 * torch.cat([functional.normalize(look, dim=1), functional.normalize(color, dim=1)], dim=1)
 
 
 class WordHead(nn.Module):
-    """Word vectors to the space of the image side: a linear map, and every word as long as any other.
+    """Word vectors to the space of the image side: one linear map for colours, one for other words; all of one length.
 
     A text is the mean of its words, so that a blue van is as much a van as it is blue.
     """
 
     def __init__(self, inputs: int) -> None:
         super().__init__()
-        self.linear = nn.Linear(inputs, DIM, bias=False)
+        self.look = nn.Linear(inputs, DIM - COLORS, bias=False)
+        self.color = nn.Linear(inputs, COLORS, bias=False)
         self.log_scale = nn.Parameter(torch.tensor(2.5))
         self.bias = nn.Parameter(torch.tensor(-6.0))
 
-    def forward(self, vectors: Tensor, share: Tensor) -> Tensor:
-        """Return unit vectors of texts, given the vectors of words and the share [texts, words] of each in a text."""
-        return functional.normalize(share @ self.words(vectors), dim=1)
+    def forward(self, vectors: Tensor, colors: Tensor, share: Tensor) -> Tensor:
+        """Return unit vectors of texts, given words as `words` takes them and the share [texts, words] of each."""
+        return functional.normalize(share @ self.words(vectors, colors), dim=1)
 
-    def words(self, vectors: Tensor) -> Tensor:
-        """Return unit vectors of words; silent words stay zero."""
-        return functional.normalize(self.linear(vectors), dim=1)
+    def words(self, vectors: Tensor, colors: Tensor) -> Tensor:
+        """Return unit vectors of words, given their vectors and which of them are colours; silent words stay zero."""
+        of = colors[:, None]
+        both = torch.cat([self.look(vectors) * ~of, self.color(vectors) * of], dim=1)
+        return functional.normalize(both, dim=1)

@@ -9,8 +9,10 @@ import cv2
 import numpy as np
 from phrases import REPAINTED, State, kinds_of
 
-SHARE = 0.5
+SHARE = 0.7
 """Of kinds and colours in a crop that are repainted."""
+PALE = 0.3
+"""Of those, the ones that lose their hue instead."""
 GREY = 0.15
 """Of crops without colour."""
 _HUES = {"red": 0, "orange": 22, "yellow": 50, "green": 120, "blue": 225}  # degrees
@@ -64,6 +66,10 @@ class Repainter:
                 continue
             usual = _mean_angle(hsv[pixels, 0])
             pixels &= _apart(hsv[..., 0], usual) < _NEAR
+            if random.random() < PALE:
+                hsv[pixels, 1] *= random.uniform(0, 0.3)
+                states[of] = self.repainted[states[of]]
+                continue
             turn = random.uniform(0, 360)
             if any(_apart(usual + turn, hue) < 2 * _NEAR for hue in self._banned[group]):
                 continue

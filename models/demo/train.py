@@ -131,7 +131,7 @@ class Truth:
     def __init__(self, lexicon: dict, drives: Drives, words: Words, device: str) -> None:
         self.phrases = build(lexicon, drives.states)
         self.table = torch.from_numpy(self.phrases.truth.T.copy()).to(device)  # states phrases
-        self.vectors, self.share = (part.to(device) for part in words.shares(self.phrases.texts))
+        self.vectors, self.of_color, self.share = (part.to(device) for part in words.shares(self.phrases.texts))
         count = np.bincount(np.concatenate([n.ravel() for n in drives.numbers]), minlength=len(drives.states))
         np.maximum.at(count, drives.repainted, count[: len(drives.repainted)])
         kinds = np.unique([s.kind for s in drives.states], return_inverse=True)[1]
@@ -159,7 +159,7 @@ def losses(
     head: WordHead,
     batch: tuple[torch.Tensor, torch.Tensor],
     truth: Truth,
-    strangers: tuple[torch.Tensor, torch.Tensor],
+    strangers: tuple[torch.Tensor, ...],
     even: float,
 ) -> torch.Tensor:
     """Return the loss of one batch; `even` as EVEN."""
@@ -168,7 +168,9 @@ def losses(
         cells = net(image)
     cells = cells.float().permute(0, 2, 3, 1).reshape(-1, cells.shape[1])
     states, scale = states.reshape(-1), head.log_scale.exp()
-    texts = head(truth.vectors + 0.05 * truth.vectors.std() * torch.randn_like(truth.vectors), truth.share)
+    texts = head(
+        truth.vectors + 0.05 * truth.vectors.std() * torch.randn_like(truth.vectors), truth.of_color, truth.share
+    )
     one = torch.stack([rows[int(torch.randint(len(rows), ()))] for rows in truth.names])
     rare = ((truth.of_class + 200) / truth.of_class.mean()) ** -even
     among = functional.cross_entropy(
@@ -222,8 +224,11 @@ def validate(net: Segmenter, head: WordHead, drives: Drives, words: Words, devic
     return float(iou[there].mean())
 
 
-def train(steps: int, device: str) -> None:
-    """Train, or go on training, up to so many steps; the learning rate falls to zero at the last one."""
+def train(steps: int, device: str, start: Path | None = None) -> None:
+    """Train, or go on training, up to so many steps; the learning rate falls to zero at the last one.
+
+    `start` is a checkpoint of another run, whose weights are taken where they fit.
+    """
     torch.manual_seed(0)
     lexicon, words = yaml.safe_load((HERE / "lexicon.yaml").read_text()), Words.read()
     drives, unseen = Drives(TRAINING, lexicon), Drives(VALIDATION, lexicon)
@@ -235,6 +240,11 @@ def train(steps: int, device: str) -> None:
     groups = [{"params": [w for w in others if w.ndim > 1], "weight_decay": 0.02},
               {"params": [w for w in others if w.ndim <= 1], "weight_decay": 0.0}]  # fmt: skip
     optimizers = [torch.optim.AdamW(groups), Muon(kernels, lr=0.0)]
+    if start is not None and not CHECKPOINT.exists():
+        own = torch.nn.ModuleList([net, head]).state_dict()
+        old = torch.load(start, weights_only=True, map_location=device)["mean"]
+        fits = {name: value for name, value in old.items() if name in own and value.shape == own[name].shape}
+        torch.nn.ModuleList([net, head]).load_state_dict(own | fits)
     mean = copy.deepcopy(torch.nn.ModuleList([net, head]))
     step = 0
     if CHECKPOINT.exists():
@@ -287,8 +297,9 @@ def train(steps: int, device: str) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--steps", type=int, default=22000)
+    parser.add_argument("--steps", type=int, default=12000)
     parser.add_argument("--threads", type=int, default=2, help="1 on a busy machine: waiting threads spin")
+    parser.add_argument("--start", type=Path, help="checkpoint of another run to begin with")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    train(options.steps, "cuda" if torch.cuda.is_available() else "cpu")
+    train(options.steps, "cuda" if torch.cuda.is_available() else "cpu", options.start)

@@ -90,9 +90,10 @@ def test_a_text_is_the_mean_of_its_words():
 
     torch.manual_seed(0)
     vectors = torch.randn(5, 16) * torch.tensor([0.0, 1.0, 9.0, 0.1, 0.0])[:, None]
-    words = Words(["[UNK]", "blue", "van", "roof", "the"], vectors, np.arange(1, 4))
+    words = Words(["[UNK]", "blue", "van", "roof", "the"], vectors, np.arange(1, 4), torch.arange(5) == 1)
     head = WordHead(16)
     both, blue, van, said = head(*words.shares(["blue van", "blue", "van", "The blue quux van!"])).detach()
     assert float(both @ blue) == pytest.approx(float(both @ van), abs=1e-5)
+    assert float(blue @ van) == 0.0
     torch.testing.assert_close(both, said)
     torch.testing.assert_close(both, torch.nn.functional.normalize(blue + van, dim=0))
