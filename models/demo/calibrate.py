@@ -1,7 +1,7 @@
 """Turn the demo pair's scores into probabilities, and write that into its card.
 
 Maps drives through cities that neither training nor evaluation sees, and fits how likely an object is what a word
-names. `THRESHOLD` was chosen on the same cities: the greatest at which nine in ten nouns of what is there are found.
+names. `THRESHOLD` was chosen on the same cities: above it, lists of what is there lose more than absent nouns gain.
 
     python models/demo/calibrate.py            # seeds 3100-3103
 """

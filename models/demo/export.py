@@ -128,6 +128,7 @@ def main() -> None:
     saved = torch.load(CHECKPOINT, weights_only=True, map_location="cpu")
     torch.nn.ModuleList([net, head]).load_state_dict(saved["mean"])
     net.eval()
+    steps = saved["before"] + saved["step"]
     names, rows, scale = table(head, words)
     (HERE / "words.txt").write_text("\n".join(names) + "\n")
     onnx.save(text_model(rows, scale), str(HERE / "text.onnx"))
@@ -149,7 +150,7 @@ def main() -> None:
         score=ScoreCard(kind="sigmoid", scale=round(head.log_scale.exp().item(), 3), bias=round(head.bias.item(), 3),
                         threshold=THRESHOLD),
         license="Apache-2.0",
-        source=f"models/demo/train.py, {saved['step']} steps on synthetic streets; words from all-MiniLM-L6-v2",
+        source=f"models/demo/train.py, {steps} steps on synthetic streets; words from all-MiniLM-L6-v2",
         sha256=sha256(path),
     )  # fmt: skip
     target = path.with_suffix(".card.yaml")

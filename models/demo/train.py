@@ -240,16 +240,18 @@ def train(steps: int, device: str, start: Path | None = None) -> None:
     groups = [{"params": [w for w in others if w.ndim > 1], "weight_decay": 0.02},
               {"params": [w for w in others if w.ndim <= 1], "weight_decay": 0.0}]  # fmt: skip
     optimizers = [torch.optim.AdamW(groups), Muon(kernels, lr=0.0)]
+    before = 0  # steps of the run that this one starts from
     if start is not None and not CHECKPOINT.exists():
         own = torch.nn.ModuleList([net, head]).state_dict()
-        old = torch.load(start, weights_only=True, map_location=device)["mean"]
-        fits = {name: value for name, value in old.items() if name in own and value.shape == own[name].shape}
+        old = torch.load(start, weights_only=True, map_location=device)
+        fits = {n: value for n, value in old["mean"].items() if n in own and value.shape == own[n].shape}
         torch.nn.ModuleList([net, head]).load_state_dict(own | fits)
+        before = old["step"] + old.get("before", 0)
     mean = copy.deepcopy(torch.nn.ModuleList([net, head]))
     step = 0
     if CHECKPOINT.exists():
         saved = torch.load(CHECKPOINT, weights_only=True, map_location=device)
-        step = saved["step"]
+        step, before = saved["step"], saved["before"]
         torch.nn.ModuleList([net, head]).load_state_dict(saved["now"])
         mean.load_state_dict(saved["mean"])
         for optimizer, state in zip(optimizers, saved["optimizers"], strict=True):
@@ -288,7 +290,7 @@ def train(steps: int, device: str, start: Path | None = None) -> None:
             mean.eval()
             print(f"{step} validation mIoU {validate(mean[0], mean[1], unseen, words, device):.3f}", flush=True)
             now = torch.nn.ModuleList([net, head]).state_dict()
-            torch.save({"step": step, "now": now, "mean": mean.state_dict(),
+            torch.save({"step": step, "before": before, "now": now, "mean": mean.state_dict(),
                         "optimizers": [optimizer.state_dict() for optimizer in optimizers]},
                        CHECKPOINT.with_suffix(".part"))  # fmt: skip
             CHECKPOINT.with_suffix(".part").rename(CHECKPOINT)
