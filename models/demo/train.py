@@ -56,14 +56,14 @@ class Drives:
                 self.images += list(drive["images"])
                 self.numbers += list(table[drive["states"]].astype(np.int16))
         self.states = list(number)
+        self._repaint = Repainter(lexicon, self.states)
+        self.repainted = self._repaint.repainted
         self.classes = np.array([_CLASS_OF.get(state.kind, -1) for state in self.states])
         self._where: dict[int, list[int]] = {}
         for at, own in enumerate(self.numbers):
             count = np.bincount(self.classes[own].ravel() + 1)[1:]
             for name in np.flatnonzero(count >= SEEN):
                 self._where.setdefault(int(name), []).append(at)
-        self._repaint = Repainter(lexicon, self.states)
-        self.repainted = self._repaint.repainted
 
     def crop(self, random: np.random.Generator, sought_share: float) -> tuple[torch.Tensor, torch.Tensor]:
         """Return a part of a picture, float [3, h, w] in 0..1, and its states, [h / 4, w / 4]."""
@@ -135,11 +135,9 @@ class Truth:
         # within a kind its rare colours and parts are seen a little more often
         self.of_kind = torch.from_numpy(of_kind + 200.0).float()
         self.within = torch.from_numpy(((count + 50) / (of_kind + 50)) ** -0.2).float()
-        classes = np.array([_CLASS_OF.get(s.kind, -1) for s in drives.states])
-        self.classes = torch.from_numpy(classes).to(device)
-        self.of_class = torch.from_numpy(
-            np.bincount(classes + 1, weights=count, minlength=len(CLASSES) + 1)[1:]
-        ).float()
+        self.classes = torch.from_numpy(drives.classes).to(device)
+        of_class = np.bincount(drives.classes + 1, weights=count, minlength=len(CLASSES) + 1)[1:]
+        self.of_class = torch.from_numpy(of_class).float()
         self.names = [torch.tensor(self.phrases.names[name], device=device) for name in CLASSES]
         self.colored = {thing: torch.tensor(rows, device=device) for thing, rows in self.phrases.colored.items()}
         colors = {color: i for i, color in enumerate(lexicon["colors"])}
