@@ -26,6 +26,9 @@ _PAINTED = 0.25
 _LIGHTEST = 0.65
 """What is lighter than this share of a thing's pixels is its paint where nothing has a hue, for the same reason."""
 
+_DOUBT = 0.1
+"""What a colour keeps that a model or a measurement excludes."""
+
 
 def oklab(rgb: UInt8[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
     """Return lightness (0..1), green-red and blue-yellow of sRGB colours."""
@@ -76,6 +79,18 @@ def degrees(colors: Float[np.ndarray, "k 4"], middle: float = MIDDLE) -> Float64
     for name, degree in (("black", black), ("white", white), ("grey", 1 - max(black, white))):
         found[NAMES.index(name)] = degree * left
     return found
+
+
+def agreed(
+    measured: Float64[np.ndarray, "m names"], told: Float64[np.ndarray, "m names"]
+) -> Float64[np.ndarray, "m names"]:
+    """Return degrees from what was measured and what a model tells, its probabilities of NAMES; of the best it is 1.
+
+    The two err apart: light and shade deceive the one, what lies behind a thin thing the other. So they are multiplied,
+    neither being trusted when it says never.
+    """
+    both = (measured + _DOUBT) * (told + _DOUBT / len(NAMES))
+    return both / both.max(axis=1, keepdims=True)
 
 
 def _hues(lab: Float32[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:

@@ -17,6 +17,7 @@ from openvocab_occ.errors import QueryError
 from openvocab_occ.objects.scene_map import SceneMap
 from openvocab_occ.objects.tree import OBJECT
 from openvocab_occ.query import algebra as q
+from openvocab_occ.query import colors
 from openvocab_occ.query.algebra import Node
 from openvocab_occ.query.boxes import Boxes
 from openvocab_occ.query.index import Index, index_of
@@ -265,7 +266,14 @@ class Evaluator:
     def _color(self, name: str, rows: Bool[np.ndarray, " n"]) -> Clause:
         degree, known = np.zeros(len(rows)), np.ones(len(rows), dtype=bool)
         at = np.flatnonzero(rows)
-        degree[at], known[at] = self.index.color_degrees(name, at)
+        if name in ("bright", "dark"):
+            light = self.index.lightness(at)
+            known[at] = ~np.isnan(light)
+            degree[at] = np.clip((light - 0.5) / 0.4 if name == "bright" else (0.7 - light) / 0.4, 0.0, 1.0)
+        else:
+            found, known[at] = self.index.color_degrees(at)
+            told = self.scorer.told(colors.NAMES, self.index.embeddings[at])
+            degree[at] = (found if told is None else colors.agreed(found, told))[:, colors.NAMES.index(name)]
         if len(at) and not known[at].any() and self._depth == 0:
             self.report.notes.append("no image gave colours")
         return Clause(np.where(known, degree, 0.0), np.where(known, degree, 1.0), np.where(known, degree, 0.5))

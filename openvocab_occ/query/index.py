@@ -71,22 +71,25 @@ class Index:
         return np.where(self._colors.any(axis=1), names, 255).astype(np.uint8)  # black is where no image gave one
 
     def color_degrees(
-        self, name: str, rows: Int64[np.ndarray, " m"]
-    ) -> tuple[Float64[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
-        """Return how far nodes are of a colour, and whether any colour of them was observed."""
-        degree, known = np.zeros(len(rows)), np.zeros(len(rows), dtype=bool)
+        self, rows: Int64[np.ndarray, " m"]
+    ) -> tuple[Float64[np.ndarray, "m names"], Bool[np.ndarray, " m"]]:
+        """Return how far nodes are of each colour in `colors.NAMES`, and whether any colour of them was observed."""
+        shown = [self._shown(int(row)) for row in rows]
+        known = np.array([len(own) > 0 for own in shown], dtype=bool)
+        degree = np.zeros((len(rows), len(colors.NAMES)))
+        for i in np.flatnonzero(known):
+            degree[i] = colors.degrees(shown[i], self._middle_light)
+        return degree, known
+
+    def lightness(self, rows: Int64[np.ndarray, " m"]) -> Float64[np.ndarray, " m"]:
+        """Return the median lightness of nodes, 0..1; NaN where no colour of them was observed."""
+        light = np.full(len(rows), np.nan)
         for i, row in enumerate(rows):
             shown = self._shown(int(row))
-            known[i] = len(shown) > 0
-            if not known[i]:
-                continue
-            if name in ("bright", "dark"):
-                lightness = colors.oklab(np.clip(np.rint(shown[:, 1:]), 0, 255).astype(np.uint8))[:, 0]
-                light = _middle(lightness, shown[:, 0])
-                degree[i] = np.clip((light - 0.5) / 0.4 if name == "bright" else (0.7 - light) / 0.4, 0.0, 1.0)
-            else:
-                degree[i] = colors.degrees(shown, self._middle_light)[colors.NAMES.index(name)]
-        return degree, known
+            if len(shown):
+                own = colors.oklab(np.clip(np.rint(shown[:, 1:]), 0, 255).astype(np.uint8))[:, 0]
+                light[i] = _middle(own, shown[:, 0])
+        return light
 
     def _shown(self, row: int) -> Float32[np.ndarray, "k 4"]:
         """Return the colours of a node: those its own pixels showed, else those of its voxels."""

@@ -163,6 +163,23 @@ class Scorer:
         cells = self.encoder.encode([_decoded(image)])[0].cells
         return self.like(cells.reshape(-1, cells.shape[-1]).mean(axis=0).astype(np.float32))
 
+    def told(self, words: Sequence[str], features: Float32[np.ndarray, "n c"]) -> Float64[np.ndarray, "n k"] | None:
+        """Return how likely each of some words is for features, one of them being right; None where no card says it.
+
+        Words that the model does not know are as likely as the others are on average.
+        """
+        if self.has_labels or self.card is None or self.card.kind == "cosine" or not features.any():
+            return None
+        known = [i for i, word in enumerate(words) if not self._unknown(word)]
+        if not known:
+            return None
+        vectors = np.stack([self._unit(self._encode(words[i])) for i in known])
+        odds = self.card.scale * (features @ vectors.T).astype(np.float64)
+        odds = np.exp(odds - odds.max(axis=1, keepdims=True))
+        found = np.full((len(features), len(words)), 1 / len(words))
+        found[:, known] = odds / odds.sum(axis=1, keepdims=True) * (len(known) / len(words))
+        return found
+
     def _classes(self, vector: Float32[np.ndarray, " c"]) -> dict[str, float]:
         """Return what each class name of the map's occupancy is worth for a text; none that the model does not know."""
         if not self.card.classes:

@@ -2,8 +2,11 @@ import colorsys
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
-from openvocab_occ.query.colors import NAMES, degrees, names_of
+from openvocab_occ.query.colors import NAMES, agreed, degrees, names_of
 
 PAINTS = {"red": (184, 40, 31), "orange": (211, 101, 29), "yellow": (217, 174, 37), "green": (47, 111, 76),
           "blue": (38, 82, 154), "brown": (106, 70, 48), "white": (235, 235, 230), "black": (32, 34, 38),
@@ -48,3 +51,27 @@ def test_grey_and_white_are_told_by_the_light_of_the_whole_picture():
     assert degrees(thing)[NAMES.index("grey")] == 1
     assert degrees(thing, middle=0.35)[NAMES.index("white")] == 1
     assert degrees(thing, middle=0.95)[NAMES.index("black")] > 0.5
+
+
+SHARES = arrays(np.float64, (3, len(NAMES)), elements=st.floats(0, 1))
+
+
+@given(SHARES, SHARES, st.permutations(range(len(NAMES))))
+def test_measurement_and_model_agree_on_a_best_colour_by_whatever_order_of_names(measured, told, order):
+    both = agreed(measured, told)
+    np.testing.assert_allclose(both.max(axis=1), 1.0)
+    assert (both > 0).all()
+    np.testing.assert_allclose(agreed(measured[:, order], told[:, order]), both[:, order])
+    even = agreed(measured, np.full_like(told, 1 / len(NAMES)))
+    np.testing.assert_array_equal(np.argsort(-even, kind="stable"), np.argsort(-(measured + 0.1), kind="stable"))
+
+
+def test_a_model_that_is_sure_settles_what_light_leaves_open_but_a_slight_leaning_changes_nothing():
+    measured, told = np.zeros((1, len(NAMES))), np.full((1, len(NAMES)), 0.02)
+    white, grey, red = (NAMES.index(name) for name in ("white", "grey", "red"))
+    measured[0, [white, grey]] = 0.4, 0.6
+    told[0, white] = 0.8
+    assert agreed(measured, told)[0, grey] < 0.5 < agreed(measured, told)[0, white]
+    measured[0] = 0
+    measured[0, red], told[0, white] = 1.0, 0.2
+    assert agreed(measured, told)[0].argmax() == red

@@ -129,6 +129,24 @@ def test_dense_maps_score_as_their_card_says():
     np.testing.assert_allclose(score_voxels(scene, "tree", encoder)[scene.voxels.features[:, 1] == 1], 0.982, atol=1e-3)
 
 
+def test_a_colour_is_what_was_measured_and_what_the_model_tells():
+    """Of two things in the same light the model says which is white; without a scale it says nothing."""
+    plain = scene_of([[1.0, 0.0], [0.0, 1.0]], contract="dense")
+    light = np.array([[1.0, 178, 179, 180]], np.float32)  # nearly white
+    lit = [replace(node, colors=light) for node in plain.objects]
+    scene = replace(plain, objects=ObjectTree([plain.objects.root, *lit]))
+    encoder = Encoder(Text())
+    encoder.text.encode = lambda texts: np.array(
+        [[float(t != "white"), float(t == "white")] for t in texts], np.float32
+    )
+    encoder.text.unknown_words = lambda text: tuple(w for w in text.split() if w not in ("white", "grey", "black"))
+    white = {hit.object.id for hit in find(scene, "white", encoder).hits}
+    encoder.scoring = Scoring(kind="sigmoid", threshold=0.5, scale=8.0)
+    assert {hit.object.id for hit in find(scene, "white", encoder).hits} == {scene.objects.level("object")[1].id}
+    assert white in (set(), {node.id for node in lit})
+    assert {hit.object.id for hit in find(scene, "bright", encoder).hits} == {node.id for node in lit}
+
+
 def test_the_class_that_occupancy_names_is_a_second_opinion():
     """It raises what it speaks for by how near its name is, lowers nothing, and leaves unknown names out."""
     plain = scene_of([[1.0, 0.0], [0.8, 0.6], [0.6, 0.8]], contract="dense")
