@@ -26,7 +26,7 @@ _PAINTED = 0.25
 _LIGHTEST = 0.65
 """What is lighter than this share of a thing's pixels is its paint where nothing has a hue, for the same reason."""
 
-_DOUBT = 0.1
+_DOUBT = 0.05
 """What a colour keeps that a model or a measurement excludes."""
 
 
