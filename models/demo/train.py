@@ -244,7 +244,7 @@ def train(steps: int, device: str, start: Path | None = None) -> None:
         old = torch.load(start, weights_only=True, map_location=device)
         fits = {n: value for n, value in old["mean"].items() if n in own and value.shape == own[n].shape}
         torch.nn.ModuleList([net, head]).load_state_dict(own | fits)
-        before = old["step"] + old.get("before", 0)
+        before = old["step"] + old["before"]
     mean = copy.deepcopy(torch.nn.ModuleList([net, head]))
     step = 0
     if CHECKPOINT.exists():

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from openvocab_occ.errors import QueryError
+from openvocab_occ.mapping.picking import Picker
 from openvocab_occ.objects.scene_map import SceneMap
 from openvocab_occ.objects.tree import OBJECT
 from openvocab_occ.query import algebra as q
@@ -267,8 +268,7 @@ class Evaluator:
         degree, known = np.zeros(len(rows)), np.ones(len(rows), dtype=bool)
         at = np.flatnonzero(rows)
         if name in ("bright", "dark"):
-            light = self.index.lightness(at)
-            known[at] = ~np.isnan(light)
+            light, known[at] = self.index.lightness(at)
             degree[at] = np.clip((light - 0.5) / 0.4 if name == "bright" else (0.7 - light) / 0.4, 0.0, 1.0)
         else:
             found, known[at] = self.index.color_degrees(at)
@@ -370,30 +370,12 @@ class Evaluator:
 
     def _clicked(self, origin: Float64[np.ndarray, " 3"], direction: Float64[np.ndarray, " 3"]) -> int:
         """Return the object of the first voxel that a ray enters."""
-        voxels = self.scene.voxels
-        hit = first_voxel(voxels.centers, voxels.voxel_size, origin, direction)
-        rows = [row for row, node in enumerate(self.index.nodes) if hit is not None and hit in node.voxels]
+        hit = Picker(self.scene.voxels).pick(origin, direction)
+        rows = [row for row, node in enumerate(self.index.nodes) if hit is not None and hit.voxel in node.voxels]
         rows = [row for row in rows if self.index.nodes[row].level in DEFAULT_LEVELS] or rows
         if not rows:
             raise QueryError("the click hits no object", got=f"from {origin.tolist()} towards {direction.tolist()}")
         return rows[0]
-
-
-def first_voxel(
-    centers: Float64[np.ndarray, "n 3"],
-    voxel_size: float,
-    origin: Float64[np.ndarray, " 3"],
-    direction: Float64[np.ndarray, " 3"],
-) -> int | None:
-    """Return the position of the first voxel that a ray enters, or None (slab test on every voxel)."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1.0 / direction
-        one = (centers - voxel_size / 2 - origin) * inverse
-        two = (centers + voxel_size / 2 - origin) * inverse
-    enter = np.nanmax(np.minimum(one, two), axis=1, initial=0.0)
-    leave = np.nanmin(np.maximum(one, two), axis=1, initial=np.inf)
-    through = np.flatnonzero(leave > enter)
-    return int(through[enter[through].argmin()]) if len(through) else None
 
 
 def _sure(degree: Float64[np.ndarray, " n"]) -> Clause:

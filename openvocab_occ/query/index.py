@@ -81,15 +81,15 @@ class Index:
             degree[i] = colors.degrees(shown[i], self._middle_light)
         return degree, known
 
-    def lightness(self, rows: Int64[np.ndarray, " m"]) -> Float64[np.ndarray, " m"]:
-        """Return the median lightness of nodes, 0..1; NaN where no colour of them was observed."""
-        light = np.full(len(rows), np.nan)
-        for i, row in enumerate(rows):
-            shown = self._shown(int(row))
-            if len(shown):
-                own = colors.oklab(np.clip(np.rint(shown[:, 1:]), 0, 255).astype(np.uint8))[:, 0]
-                light[i] = _middle(own, shown[:, 0])
-        return light
+    def lightness(self, rows: Int64[np.ndarray, " m"]) -> tuple[Float64[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
+        """Return the median lightness of nodes, 0..1, and whether any colour of them was observed."""
+        shown = [self._shown(int(row)) for row in rows]
+        known = np.array([len(own) > 0 for own in shown], dtype=bool)
+        light = np.zeros(len(rows))
+        for i in np.flatnonzero(known):
+            own = colors.oklab(np.clip(np.rint(shown[i][:, 1:]), 0, 255).astype(np.uint8))[:, 0]
+            light[i] = _middle(own, shown[i][:, 0])
+        return light, known
 
     def _shown(self, row: int) -> Float32[np.ndarray, "k 4"]:
         """Return the colours of a node: those its own pixels showed, else those of its voxels."""

@@ -24,7 +24,7 @@ DENSE_THRESHOLD = DEFAULT_THRESHOLD["cosine"]
 LIKE_THRESHOLD = 0.8
 """Cosine of two things that look alike: image features lie closer to each other than to words."""
 _MAX_PIXELS = 1 << 25
-_NAMED: "WeakKeyDictionary[SceneMap, dict[str, np.ndarray]]" = WeakKeyDictionary()
+_KNOWN: "WeakKeyDictionary[SceneMap, dict[str, np.ndarray | None]]" = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -168,16 +168,17 @@ class Scorer:
 
         Words that the model does not know are as likely as the others are on average.
         """
-        if self.has_labels or self.card is None or self.card.kind == "cosine" or not features.any():
+        if self.has_labels or self.encoder is None or self.encoder.text is None or self.card is None:
             return None
-        known = [i for i, word in enumerate(words) if not self._unknown(word)]
-        if not known:
+        vectors = {} if self.card.kind == "cosine" else self._known(words)
+        if not vectors:
             return None
-        vectors = np.stack([self._unit(self._encode(words[i])) for i in known])
-        odds = self.card.scale * (features @ vectors.T).astype(np.float64)
+        odds = self.card.scale * (features @ np.stack(list(vectors.values())).T).astype(np.float64)
         odds = np.exp(odds - odds.max(axis=1, keepdims=True))
         found = np.full((len(features), len(words)), 1 / len(words))
-        found[:, known] = odds / odds.sum(axis=1, keepdims=True) * (len(known) / len(words))
+        found[:, [words.index(word) for word in vectors]] = (
+            odds / odds.sum(axis=1, keepdims=True) * (len(vectors) / len(words))
+        )
         return found
 
     def _classes(self, vector: Float32[np.ndarray, " c"]) -> dict[str, float]:
@@ -189,15 +190,16 @@ class Scorer:
 
     def nearness(self, vector: Float32[np.ndarray, " c"], neutral: float) -> dict[str, float]:
         """Return by how much each class name of the map's occupancy is nearer to a text than `neutral`; only those."""
-        near = {name: float(own @ vector) - neutral for name, own in self._named().items()}
+        near = {name: float(own @ vector) - neutral for name, own in self._known(self._class_names).items()}
         return {name: above for name, above in near.items() if above > 0}
 
-    def _named(self) -> dict[str, Float32[np.ndarray, " c"]]:
-        """Return the vector of each class name that the text model knows, encoded once a map."""
-        if self._scene not in _NAMED:
-            known = [name for name in self._class_names if not self._unknown(name)]
-            _NAMED[self._scene] = {name: self._unit(self._encode(name)) for name in known}
-        return _NAMED[self._scene]
+    def _known(self, words: Sequence[str]) -> dict[str, Float32[np.ndarray, " c"]]:
+        """Return the vector of each word that the text model knows, encoded once a map."""
+        kept = _KNOWN.setdefault(self._scene, {})
+        for word in words:
+            if word not in kept:
+                kept[word] = None if self._unknown(word) else self._unit(self._encode(word))
+        return {word: vector for word in words if (vector := kept[word]) is not None}
 
     def _unit(self, vector: Float32[np.ndarray, " c"]) -> Float32[np.ndarray, " c"]:
         vector = np.asarray(vector, dtype=np.float32)

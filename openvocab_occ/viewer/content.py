@@ -11,11 +11,11 @@ from jaxtyping import Float64, Int32, Int64
 from openvocab_occ.datasets.frame import Frame
 from openvocab_occ.export.render import heading, overview, owners
 from openvocab_occ.export.semantics import Semantics, name_voxels
+from openvocab_occ.mapping.picking import Picker
 from openvocab_occ.objects.scene_map import SceneMap
 from openvocab_occ.objects.tree import SceneObject
 from openvocab_occ.segmentation.encoder import PixelEncoder
 from openvocab_occ.viewer.colors import Painted, paint_voxels
-from openvocab_occ.viewer.picking import Picker
 from openvocab_occ.viewer.tiles import Tile, tile_bounds, tile_voxels
 
 _FRAMES_KEPT = 8  # images of so many frames stay in memory

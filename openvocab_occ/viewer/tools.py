@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from openvocab_occ.export.render import render_map
+from openvocab_occ.mapping.picking import Pick
 from openvocab_occ.objects.box import Box
 from openvocab_occ.viewer.drawing import MEASURE_COLOR, SELECT_COLOR, box_edges
-from openvocab_occ.viewer.picking import Pick
 from openvocab_occ.viewer.work import IsCurrent
 
 if TYPE_CHECKING:

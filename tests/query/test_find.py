@@ -140,11 +140,12 @@ def test_a_colour_is_what_was_measured_and_what_the_model_tells():
         [[float(t != "white"), float(t == "white")] for t in texts], np.float32
     )
     encoder.text.unknown_words = lambda text: tuple(w for w in text.split() if w not in ("white", "grey", "black"))
-    white = {hit.object.id for hit in find(scene, "white", encoder).hits}
+    assert find(scene, "white", encoder).verdict == "absent"
     encoder.scoring = Scoring(kind="sigmoid", threshold=0.5, scale=8.0)
     assert {hit.object.id for hit in find(scene, "white", encoder).hits} == {scene.objects.level("object")[1].id}
-    assert white in (set(), {node.id for node in lit})
     assert {hit.object.id for hit in find(scene, "bright", encoder).hits} == {node.id for node in lit}
+    encoder.text = None
+    assert find(scene, "white", encoder).verdict == "absent"
 
 
 def test_the_class_that_occupancy_names_is_a_second_opinion():

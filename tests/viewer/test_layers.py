@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from openvocab_occ.errors import ConfigError
 from openvocab_occ.export.palette import NOTHING, UNLABELLED, label_colors, paint_labels, paint_numbers
 from openvocab_occ.mapping import Lifted, VoxelMap
+from openvocab_occ.mapping.picking import Picker
 from openvocab_occ.objects.box import Box
 from openvocab_occ.pipeline.combine import only
 from openvocab_occ.pipeline.compare import diff
@@ -18,7 +19,6 @@ from openvocab_occ.viewer.colors import COLOR_MODES, grey_but, object_colors, pa
 from openvocab_occ.viewer.content import Content
 from openvocab_occ.viewer.drawing import box_edges
 from openvocab_occ.viewer.layers import ChangesLayer, GridLayer, Layer, PathLayer, SliceLayer, TileMapLayer
-from openvocab_occ.viewer.picking import Picker
 from openvocab_occ.viewer.points import Eye, Points
 from openvocab_occ.viewer.tiles import LEVELS, choose_levels, distances, tile_bounds, tile_voxels
 

@@ -1,4 +1,4 @@
-"""What lies under the pointer: points cannot be clicked in the browser, so rays are cast through the map here."""
+"""The first voxel of a map that a ray meets: what lies under a pointer."""
 
 from collections import OrderedDict
 from threading import Lock
