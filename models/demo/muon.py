@@ -13,20 +13,22 @@ _QUINTIC = (3.4445, -4.7750, 2.0315)  # drives singular values to about 1
 _ROUNDS = 5
 
 
-def orthogonal(matrix: Tensor) -> Tensor:
-    """Return about U V' of a matrix U S V': Newton-Schulz iteration, on its Gram matrix, which is smaller."""
+def orthogonal(matrices: Tensor) -> Tensor:
+    """Return about U V' of matrices U S V', [..., m, n]: Newton-Schulz iteration on Gram matrices; they are smaller."""
     a, b, c = _QUINTIC
-    tall = matrix.shape[0] > matrix.shape[1]
-    x = matrix.T if tall else matrix
-    x = x / (x.norm() + 1e-7)
-    gram = x @ x.T
-    product = torch.eye(len(gram), device=x.device)
-    for _ in range(_ROUNDS):
-        factor = torch.addmm(gram, gram, gram, beta=b, alpha=c)
-        factor.diagonal().add_(a)
-        product, gram = factor @ product, factor @ gram @ factor
+    tall = matrices.shape[-2] > matrices.shape[-1]
+    x = matrices.mT if tall else matrices
+    x = x / (x.norm(dim=(-2, -1), keepdim=True) + 1e-7)
+    gram = x @ x.mT
+    product = None
+    for step in range(_ROUNDS):
+        factor = (gram @ gram).mul_(c).add_(gram, alpha=b)
+        factor.diagonal(dim1=-2, dim2=-1).add_(a)
+        product = factor if product is None else factor @ product
+        if step < _ROUNDS - 1:
+            gram = factor @ gram @ factor
     x = product @ x
-    return x.T if tall else x
+    return x.mT if tall else x
 
 
 class Muon(torch.optim.Optimizer):
@@ -39,12 +41,19 @@ class Muon(torch.optim.Optimizer):
     def step(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Take a step along the gradients."""
         for group in self.param_groups:
+            alike: dict[torch.Size, list[Tensor]] = {}  # matrices of one shape go through at once
             for weight in group["params"]:
-                if weight.grad is None:
-                    continue
-                mean = self.state[weight].setdefault("mean", torch.zeros_like(weight))
-                mean.lerp_(weight.grad, 1 - group["momentum"])
-                along = weight.grad.lerp(mean, group["momentum"]).flatten(1)
-                gain = max(1.0, along.shape[0] / along.shape[1]) ** 0.5
-                weight.mul_(1 - group["lr"] * group["weight_decay"])
-                weight.add_(orthogonal(along).view_as(weight), alpha=-group["lr"] * gain)
+                if weight.grad is not None:
+                    alike.setdefault(weight.shape, []).append(weight)
+            for weights in alike.values():
+                along = [self._along(weight, group["momentum"]).flatten(1) for weight in weights]
+                gain = max(1.0, along[0].shape[0] / along[0].shape[1]) ** 0.5
+                for weight, step in zip(weights, orthogonal(torch.stack(along)), strict=True):
+                    weight.mul_(1 - group["lr"] * group["weight_decay"])
+                    weight.add_(step.view_as(weight), alpha=-group["lr"] * gain)
+
+    def _along(self, weight: Tensor, momentum: float) -> Tensor:
+        """Return the gradient with Nesterov's momentum."""
+        mean = self.state[weight].setdefault("mean", torch.zeros_like(weight))
+        mean.lerp_(weight.grad, 1 - momentum)
+        return weight.grad.lerp(mean, momentum)

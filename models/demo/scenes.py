@@ -11,7 +11,9 @@ In some of the training cities many cars give way to what is rare in a street: b
 """
 
 import sys
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -157,9 +159,11 @@ def write_drive(seed: int, lexicon: dict, folder: Path = CACHE) -> Path:
 def main() -> None:
     """Render all drives, validation first."""
     lexicon = yaml.safe_load((HERE / "lexicon.yaml").read_text())
-    for done, seed in enumerate((*VALIDATION, *TRAINING), start=1):
-        write_drive(seed, lexicon)
-        print(f"\r{done} of {len(TRAINING) + len(VALIDATION)} drives", end="", file=sys.stderr)
+    with ProcessPoolExecutor(mp_context=get_context("spawn")) as processes:
+        drives = [processes.submit(write_drive, seed, lexicon) for seed in (*VALIDATION, *TRAINING)]
+        for done, drive in enumerate(as_completed(drives), start=1):
+            drive.result()
+            print(f"\r{done} of {len(drives)} drives", end="", file=sys.stderr)
 
 
 if __name__ == "__main__":
