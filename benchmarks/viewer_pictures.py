@@ -94,8 +94,8 @@ SCENES: dict[str, Callable[[Any], None]] = {"city": city, "keyframe": keyframe, 
 
 
 def mapped(name: str, sequence: Any, encoder: Any) -> ovo.SceneMap:
-    """Return the map of a drive, built now or kept from before."""
-    path = OUT / f"{name}.ovmap"
+    """Return the map of a drive, built now or kept from before by the same model."""
+    path = OUT / f"{name}-{encoder.fingerprint[:12]}.ovmap"
     if not path.is_dir():
         ovo.build_map(sequence, encoder, progress=lambda done, of: print(f"{name}: {done} of {of} frames")).save(path)
     return ovo.SceneMap.open(path)

@@ -183,15 +183,22 @@ class Scorer:
 
     def _classes(self, vector: Float32[np.ndarray, " c"]) -> dict[str, float]:
         """Return what each class name of the map's occupancy is worth for a text; none that the model does not know."""
-        if not self.card.classes:
+        if not (self.card.classes or self.card.others):
             return {}
-        near = self.nearness(vector, self.card.neutral)
-        return {name: self.card.classes * above for name, above in near.items()}
+        spoken = self.spoken(vector, self.card.neutral)
+        return {name: self.card.classes * pro - self.card.others * con for name, (pro, con) in spoken.items()}
 
-    def nearness(self, vector: Float32[np.ndarray, " c"], neutral: float) -> dict[str, float]:
-        """Return by how much each class name of the map's occupancy is nearer to a text than `neutral`; only those."""
-        near = {name: float(own @ vector) - neutral for name, own in self._known(self._class_names).items()}
-        return {name: above for name, above in near.items() if above > 0}
+    def spoken(self, vector: Float32[np.ndarray, " c"], neutral: float) -> dict[str, tuple[float, float]]:
+        """Return how much each class name of the map's occupancy speaks for a text, and how much against it.
+
+        For it: the cosine above `neutral`. Against it: by how much another name is nearer, times how surely that one is
+        meant, which is its cosine above `neutral` as a share of the most there can be. A car is no truck; but where a
+        text names none of the classes, or one of them only roughly, the others say nothing.
+        """
+        known = self._known(self._class_names)
+        near = {name: max(float(own @ vector) - neutral, 0.0) for name, own in known.items()}
+        most = max(near.values(), default=0.0)
+        return {name: (own, most / (1 - neutral) * (most - own)) for name, own in near.items()} if most else {}
 
     def _known(self, words: Sequence[str]) -> dict[str, Float32[np.ndarray, " c"]]:
         """Return the vector of each word that the text model knows, encoded once a map."""

@@ -176,7 +176,10 @@ class Calibration(_Strict, frozen=True, kw_only=True):
     """Labelled voxels it was fitted on, or pairs of an object and a word."""
     classes: float = 0.0
     """What the class that occupancy names is worth: where its name is nearer to the text than `neutral`, classes x
-    (their cosine - neutral) is added before the sigmoid. Other names say nothing: such classes are coarse."""
+    (their cosine - neutral) is added before the sigmoid."""
+    others: float = 0.0
+    """What it is worth against a text that surely means another class: others x s x (n - own), with n the greatest
+    cosine - neutral of any class, own that of this one, and s = n / (1 - neutral), is taken away before the sigmoid."""
     neutral: float = 0.0
 
 

@@ -32,6 +32,7 @@ class Scoring:
     """Unit vectors that a text must win against; relevancy only."""
     classes: float = 0.0
     """What the name of an occupancy class is worth; see `card.Calibration`."""
+    others: float = 0.0
     neutral: float = 0.0
 
     def __call__(
@@ -58,8 +59,9 @@ def scoring_of(card: ScoreCard, text: TextEncoder) -> Scoring:
     if card.calibration is not None:
         fit = card.calibration
         return Scoring(
-            kind=kind, threshold=threshold, scale=fit.a, bias=fit.b, classes=fit.classes, neutral=fit.neutral
-        )
+            kind=kind, threshold=threshold, scale=fit.a, bias=fit.b,
+            classes=fit.classes, others=fit.others, neutral=fit.neutral,
+        )  # fmt: skip
     negatives = np.asarray(text.encode(card.negatives), dtype=np.float32) if card.negatives else None
     return Scoring(kind=kind, threshold=threshold, scale=card.scale or 1.0, bias=card.bias, negatives=negatives)
 

@@ -149,7 +149,7 @@ def test_a_colour_is_what_was_measured_and_what_the_model_tells():
 
 
 def test_the_class_that_occupancy_names_is_a_second_opinion():
-    """It raises what it speaks for by how near its name is, lowers nothing, and leaves unknown names out."""
+    """It raises what it speaks for by how near its name is, and leaves unknown names out."""
     plain = scene_of([[1.0, 0.0], [0.8, 0.6], [0.6, 0.8]], contract="dense")
     names = ("car", "tree", "xyzzy")
     named = [replace(node, label=name, score=0.5) for node, name in zip(plain.objects, names, strict=True)]
@@ -163,6 +163,33 @@ def test_the_class_that_occupancy_names_is_a_second_opinion():
     for label, logit in logits.items():
         assert score[label] == pytest.approx(1 / (1 + np.exp(-logit)), rel=1e-5)
     assert [hit.probability for hit in answer.hits] == [hit.score for hit in answer.hits]
+
+
+@pytest.mark.parametrize(
+    ("angle", "against"),
+    [
+        (0, {"truck": (1 - 0.6) / 0.4 * (1 - 0.8), "tree": (1 - 0.6) / 0.4 * (1 - 0.6)}),  # "car" itself
+        (-0.3, {"truck": (np.cos(0.3) - 0.6) / 0.4 * (np.cos(0.3) - max(np.cos(0.3 + np.arccos(0.8)), 0.6))}),
+        (-1.2, {}),  # nothing like any class
+    ],
+)
+def test_a_thing_of_another_class_is_less_likely_the_one_that_a_text_surely_names(angle, against):
+    plain = scene_of([[0.6, 0.8]] * 4, contract="dense")
+    vectors = {"car": [1, 0], "truck": [0.8, 0.6], "tree": [0, 1], "asked": [np.cos(angle), np.sin(angle)]}
+    labels = ("car", "truck", "tree", "")
+    named = [replace(node, label=name, score=0.5) for node, name in zip(plain.objects, labels, strict=True)]
+    scene = replace(plain, objects=ObjectTree([plain.objects.root, *named]), class_names=("car", "truck", "tree"))
+    encoder = Encoder(Text())
+    encoder.text.encode = lambda texts: np.array([vectors[t] for t in texts], np.float32)
+    encoder.scoring = Scoring(kind="probability", threshold=0.0, scale=4.0, bias=-1.0, others=30.0, neutral=0.6)
+    score = {hit.object.label: hit.score for hit in find(scene, "asked", encoder).hits}
+    look = 4 * np.dot([0.6, 0.8], vectors["asked"]) - 1
+    for label in ("car", "", *against):
+        logit = look - 30 * 0.5 * against.get(label, 0)
+        assert score[label] == pytest.approx(1 / (1 + np.exp(-logit)), rel=1e-5)
+    assert score["car"] == score[""], "neither the class itself nor a thing without one is less likely"
+    if not against:
+        assert len(set(score.values())) == 1
 
 
 def test_things_that_are_likelier_there_than_not_are_counted():
