@@ -127,8 +127,6 @@ def main() -> None:
     net, head = Segmenter(), WordHead(words.dim)
     saved = torch.load(CHECKPOINT, weights_only=True, map_location="cpu")
     torch.nn.ModuleList([net, head]).load_state_dict(saved["mean"])
-    net.eval()
-    steps = saved["before"] + saved["step"]
     names, rows, scale = table(head, words)
     (HERE / "words.txt").write_text("\n".join(names) + "\n")
     onnx.save(text_model(rows, scale), str(HERE / "text.onnx"))
@@ -138,7 +136,7 @@ def main() -> None:
     lexicon = yaml.safe_load((HERE / "lexicon.yaml").read_text())
     with TemporaryDirectory() as scratch:
         whole, example = Path(scratch) / "whole.onnx", {"image": torch.rand(2, 3, 96, 160)}
-        off = export_module(CellsLast(net), whole, example, outputs=["features"], dynamic={"image": sides})
+        off = export_module(CellsLast(net).eval(), whole, example, outputs=["features"], dynamic={"image": sides})
         quantize(whole, path, Drives(TRAINING[::8], lexicon))
         alike = np.mean([agreement(whole, path, image) for image in Drives(VALIDATION, lexicon).images[::16]])
     card = Card(
@@ -150,7 +148,7 @@ def main() -> None:
         score=ScoreCard(kind="sigmoid", scale=round(head.log_scale.exp().item(), 3), bias=round(head.bias.item(), 3),
                         threshold=THRESHOLD),
         license="Apache-2.0",
-        source=f"models/demo/train.py, {steps} steps on synthetic streets; words from all-MiniLM-L6-v2",
+        source=f"models/demo/train.py, {saved['step']} steps on synthetic streets; words from all-MiniLM-L6-v2",
         sha256=sha256(path),
     )  # fmt: skip
     target = path.with_suffix(".card.yaml")

@@ -223,11 +223,8 @@ def validate(net: Segmenter, head: WordHead, drives: Drives, words: Words, devic
     return float(iou[there].mean())
 
 
-def train(steps: int, device: str, start: Path | None = None) -> None:
-    """Train, or go on training, up to so many steps; the learning rate falls to zero at the last one.
-
-    `start` is a checkpoint of another run, whose weights are taken where they fit.
-    """
+def train(steps: int, device: str) -> None:
+    """Train, or go on training, up to so many steps; the learning rate falls to zero at the last one."""
     torch.manual_seed(0)
     lexicon, words = yaml.safe_load((HERE / "lexicon.yaml").read_text()), Words.read()
     drives, unseen = Drives(TRAINING, lexicon), Drives(VALIDATION, lexicon)
@@ -243,18 +240,11 @@ def train(steps: int, device: str, start: Path | None = None) -> None:
     groups = [{"params": [w for w in others if w.ndim > 1], "weight_decay": 0.02},
               {"params": [w for w in others if w.ndim <= 1], "weight_decay": 0.0}]  # fmt: skip
     optimizers = [torch.optim.AdamW(groups, fused=True), Muon(kernels, lr=0.0)]
-    before = 0  # steps of the run that this one starts from
-    if start is not None and not CHECKPOINT.exists():
-        own = torch.nn.ModuleList([net, head]).state_dict()
-        old = torch.load(start, weights_only=True, map_location=device)
-        fits = {n: value for n, value in old["mean"].items() if n in own and value.shape == own[n].shape}
-        torch.nn.ModuleList([net, head]).load_state_dict(own | fits)
-        before = old["step"] + old["before"]
     mean = copy.deepcopy(torch.nn.ModuleList([net, head]))
     step = 0
     if CHECKPOINT.exists():
         saved = torch.load(CHECKPOINT, weights_only=True, map_location=device)
-        step, before = saved["step"], saved["before"]
+        step = saved["step"]
         torch.nn.ModuleList([net, head]).load_state_dict(saved["now"])
         mean.load_state_dict(saved["mean"])
         for optimizer, state in zip(optimizers, saved["optimizers"], strict=True):
@@ -293,7 +283,7 @@ def train(steps: int, device: str, start: Path | None = None) -> None:
             mean.eval()
             print(f"{step} validation mIoU {validate(mean[0], mean[1], unseen, words, device):.3f}", flush=True)
             now = torch.nn.ModuleList([net, head]).state_dict()
-            torch.save({"step": step, "before": before, "now": now, "mean": mean.state_dict(),
+            torch.save({"step": step, "now": now, "mean": mean.state_dict(),
                         "optimizers": [optimizer.state_dict() for optimizer in optimizers]},
                        CHECKPOINT.with_suffix(".part"))  # fmt: skip
             CHECKPOINT.with_suffix(".part").rename(CHECKPOINT)
@@ -304,7 +294,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--steps", type=int, default=11000)
     parser.add_argument("--threads", type=int, default=2, help="1 on a busy machine: waiting threads spin")
-    parser.add_argument("--start", type=Path, help="checkpoint of another run to begin with")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    train(options.steps, "cuda" if torch.cuda.is_available() else "cpu", options.start)
+    train(options.steps, "cuda" if torch.cuda.is_available() else "cpu")

@@ -22,7 +22,7 @@ NEUTRAL = 0.6
 """Cosine of two words from which one of them speaks for the other. Of this text encoder, kinds of vehicle reach it."""
 _CATEGORIES = ("class", "synonym", "absent")
 _PRIOR = 0.03
-"""Of a weight: evidence that never occurs weighs nothing, and what never erred on true grids not without end."""
+"""Ridge on the weights: evidence that never occurs gets none; such as never erred on these drives, a finite one."""
 _STEPS = 50
 
 

@@ -39,7 +39,7 @@ class Reading:
     negatives: Float32[np.ndarray, "k c"] | None = None
     """Unit vectors that the text must win against."""
     classes: Mapping[str, float] = field(default_factory=dict[str, float])
-    """What a name of an occupancy class adds before the sigmoid; others add nothing."""
+    """What a name of an occupancy class adds before the sigmoid, below 0 where it speaks against; others: nothing."""
 
     def score(
         self, features: Float32[np.ndarray, "n c"], said: Float[np.ndarray, " n"] | None = None

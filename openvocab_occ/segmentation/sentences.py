@@ -72,7 +72,7 @@ def _score(card: Card | FilesCard) -> str:
     if score.calibration is not None:
         fit = score.calibration
         named = f" + {fit.classes:.2f} (cosine of class and text - {fit.neutral:.2f})" if fit.classes else ""
-        named += f" - {fit.others:.2f} (what another class is nearer)" if fit.others else ""
+        named += f" - {fit.others:.2f} (how surely and by how much another class is nearer)" if fit.others else ""
         formula = f"probability, sigmoid({fit.a:.2f} cosine {fit.b:+.2f}{named})"
         return f"{formula}, fitted on {fit.count:,} of {fit.dataset}, {fit.date}"
     said = {

@@ -1,6 +1,7 @@
 """What the demo pair is trained with: steps of Muon, repainted vehicles, and texts as means of words."""
 
 import sys
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ def scripts():
     sys.path.insert(0, str(FOLDER))
     yield
     sys.path.remove(str(FOLDER))
-    for name in ("muon", "network", "phrases", "repaint", "words"):
+    for name in ("muon", "network", "phrases", "repaint", "scenes", "train", "words"):
         sys.modules.pop(name, None)
 
 
@@ -52,6 +53,63 @@ def test_steps_of_muon_find_a_minimum():
         ((weight - wanted) ** 2).sum().backward()
         optimizer.step()
     assert (weight - wanted).abs().max() < 0.05
+
+
+def test_weights_of_one_shape_step_as_each_would_alone():
+    from muon import Muon
+
+    torch.manual_seed(0)
+    first = [torch.randn(shape) for shape in ((6, 4, 3, 3), (6, 4, 3, 3), (40, 8, 1, 1), (6, 4, 3, 3))]
+    gradients = [torch.randn_like(weight) for weight in first]
+
+    def stepped(group):
+        weights = [torch.nn.Parameter(first[n].clone()) for n in group]
+        for weight, n in zip(weights, group, strict=True):
+            weight.grad = gradients[n]
+        optimizer = Muon(weights, lr=0.1)
+        optimizer.step()
+        optimizer.step()
+        return [weight.detach() for weight in weights]
+
+    for together, n in zip(stepped(range(4)), range(4), strict=True):
+        torch.testing.assert_close(together, stepped([n])[0], atol=1e-5, rtol=1e-5)
+        assert (together - first[n]).abs().max() > 0.01
+
+
+def test_agreement_is_the_weighted_cross_entropy_over_what_is_sure():
+    import train
+
+    torch.manual_seed(0)
+    logits, truth = 8 * torch.randn(50, 30), torch.randint(-1, 2, (50, 30))
+    table = torch.where(truth == 1, train._POSITIVE, torch.where(truth == train.UNSURE, 0.0, -1.0))
+    each = torch.nn.functional.binary_cross_entropy_with_logits(
+        logits, (truth == 1).float(), pos_weight=torch.tensor(train._POSITIVE), reduction="none"
+    )
+    torch.testing.assert_close(train._agreement(logits, table), each[truth != train.UNSURE].mean())
+
+
+def test_the_loss_of_colours_is_the_cross_entropy_of_each_thing_that_a_cell_is():
+    """A cell of a red van is asked its colour as a van and as a vehicle; what has no colour is asked nothing."""
+    import train
+
+    torch.manual_seed(0)
+    cells, texts = torch.randn(40, 8), torch.randn(20, 8)
+    states = torch.randint(5, (40,))
+    truth = SimpleNamespace(
+        things=torch.tensor([[1, 1, 0, 0, 1], [1, 0, 0, 1, 0]]).bool(),
+        colors=torch.tensor([0, 2, 1, 2, -1]),
+        colored=torch.tensor([[[0, 1, 2]], [[3, -1, 4]]]),  # things words colours; -1 is never said
+    )
+    losses = []
+    for thing in range(2):
+        for cell, state in zip(cells, states, strict=True):
+            if truth.things[thing, state] and truth.colors[state] >= 0:
+                rows = truth.colored[thing, 0]
+                said = [float(cell @ texts[row]) if row >= 0 else -1e4 for row in rows]
+                losses.append(np.log(np.exp(np.array(said) - said[truth.colors[state]]).sum()))
+    assert float(train._color_loss(cells, states, texts, truth)) == pytest.approx(np.mean(losses), rel=1e-5)
+    none = torch.full_like(states, 4)
+    assert train._color_loss(cells, none, texts, truth) == 0
 
 
 def test_no_vehicle_is_repainted_in_a_colour_that_is_kept_out():

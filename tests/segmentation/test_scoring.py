@@ -44,9 +44,10 @@ def test_sigmoid_cosine_and_probability(seed, scale, bias):
     score = scoring_of(ScoreCard(kind="sigmoid", scale=scale, bias=bias), Text())
     np.testing.assert_allclose(score(features, vector), wanted, atol=1e-5)
     assert score.threshold == 0.5
-    told = Calibration(a=scale, b=bias, dataset="d", date="2026-01-01", count=9)
+    told = Calibration(a=scale, b=bias, classes=3.0, others=7.0, neutral=0.5, dataset="d", date="2026-01-01", count=9)
     fitted = scoring_of(ScoreCard(kind="relevancy", scale=5.0, negatives=("x",), calibration=told), Text())
     assert fitted.kind == "probability"
+    assert (fitted.classes, fitted.others, fitted.neutral) == (3, 7, 0.5)
     np.testing.assert_allclose(fitted(features, vector), wanted, atol=1e-5)
 
 
